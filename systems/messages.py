@@ -181,14 +181,12 @@ class CalibrationStatus(Message):
     observations: tuple[Observation, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     estimate: CalibrationEstimate | None = None
-    predicted_error_m: float = (
-        np.inf
-    )  # expected error of a point at the work point, from the estimate's own covariance and noise
+    # expected error of a point at the work point, from the estimate's own covariance and noise
+    predicted_error_m: float = np.inf
     verification_cloud: Verification | None = None  # P_v of Algorithm 1
     algorithm_1: Algorithm1State | None = None
-    history: tuple[
-        tuple[int, float, float, float], ...
-    ] = ()  # scans, predicted error, held-out median, Algorithm 1's figure; m
+    # scans, predicted error, held-out median, Algorithm 1's figure; m
+    history: tuple[tuple[int, float, float, float], ...] = ()
     verifications: tuple[VerificationResult, ...] = ()
     done: bool = False
     message: str = ""
@@ -261,9 +259,8 @@ class PlannedSeam(Message):
     # torch at one place
     arm_sigma_m: float = np.nan
     arm_turn_rad: float = np.nan
-    lean_rad: float = (
-        0.0  # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
-    )
+    # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
+    lean_rad: float = 0.0
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:

@@ -407,16 +407,13 @@ def _export(
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")
         return
-    source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth)))
-    source.set_name("truth")
+    source = builder.AddNamedSystem("truth", ConstantValueSource(AbstractValue.Make(truth)))
     builder.ExportOutput(source.get_output_port(), "cheat.truth")
     if truth.X_BC is not None:
-        camera = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth.X_BC)))
-        camera.set_name("true_X_BC")
+        camera = builder.AddNamedSystem("true_X_BC", ConstantValueSource(AbstractValue.Make(truth.X_BC)))
         builder.ExportOutput(camera.get_output_port(), "cheat.X_BC")
     if build.tool is not None:
-        cheat = builder.AddSystem(CheatPoses(world, build.tool))
-        cheat.set_name("cheat_poses")
+        cheat = builder.AddNamedSystem("cheat_poses", CheatPoses(world, build.tool))
         builder.Connect(world.plant.get_body_poses_output_port(), cheat.GetInputPort("body_poses"))
         builder.ExportOutput(cheat.GetOutputPort("contact"), "cheat.contact")
         builder.ExportOutput(cheat.GetOutputPort("torch"), "cheat.torch")

@@ -36,8 +36,7 @@ class Wiring:
 
     def add(self, name: str, system: AnySystem) -> AnySystem:
         """Add a system under its name."""
-        system.set_name(name)
-        self.builder.AddSystem(system)
+        self.builder.AddNamedSystem(name, system)
         return system
 
     def connect(self, system: LeafSystem, **sources: OutputPort) -> None:

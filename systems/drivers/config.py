@@ -8,11 +8,18 @@ from typing import ClassVar
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
 
 DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe")
 """The devices of a station, by their key in the scenario; drivers are applied in this order."""
+
+
+def check_range(key: str, value: float, low: float, high: float) -> None:
+    """Raise InputError for a key of the scenario whose value is not from `low` to `high`."""
+    if not low <= value <= high:
+        raise InputError(f"{key} must be from {low:g} to {high:g}, and it is {value:g}.")
 
 
 class DriverConfig:

@@ -6,13 +6,19 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
-from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.framework import DiagramBuilder, InputPort, LeafSystem, OutputPort
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.wall_clock import WallClock
 
+ARM_PORTS = tuple(
+    f"arm.{name}"
+    for name in ("velocity_command", "position_measured", "velocity_measured", "X_BF", "sample_time", "status")
+)
+"""The ports that every robot's driver exports."""
 Part = TypeVar("Part")
+SystemOf = TypeVar("SystemOf", bound=LeafSystem)
 
 
 class Closable(Protocol):
@@ -84,6 +90,17 @@ class StationBuild:
         """
         clock = None if self.robot is None else self.robot.clock
         return clock is None or (self.robot is not None and self.robot.waits and not clock.follows)
+
+    def add(self, name: str, system: SystemOf, *exported: str) -> SystemOf:
+        """Add a system under its name, and export its ports as the station names them, such as `scanner.trigger`."""
+        self.builder.AddNamedSystem(name, system)
+        for port in exported:
+            own = port.rpartition(".")[2]
+            if system.HasInputPort(own):
+                self.inputs[port] = system.GetInputPort(own)
+            else:
+                self.outputs[port] = system.GetOutputPort(own)
+        return system
 
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""

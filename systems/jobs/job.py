@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Generic, TypeVar
 
@@ -29,6 +30,7 @@ Phases = Sequence[tuple[str, float, float]]
 MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 
+@dataclass(eq=False, kw_only=True)
 class AddedJob(ABC):
     """A job's systems in a cell, as seen by the run loop, the reports and the tests."""
 

@@ -264,6 +264,19 @@ class Spine:
         """The first arm."""
         return self.arms[0]
 
+    def serve(self, procedure: LeafSystem, **sources: OutputPort) -> None:
+        """Connect the ports of a job's procedure: those that the spine knows by their names, and `sources`."""
+        first = self.arm
+        known = {
+            **dict.fromkeys(("position_measured", "position"), first.position),
+            "settled_goal": first.settled_goal,
+            "robot_status": first.status,
+            "history": first.history,
+            "hold": self.end,
+        }
+        known = {name: port for name, port in known.items() if procedure.HasInputPort(name)}
+        self.wiring.connect(procedure, **known, **sources)
+
     def connect(self, job: JobPorts) -> None:
         """Connect the ports of the job."""
         w, first = self.wiring, self.arm

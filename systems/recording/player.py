@@ -89,7 +89,6 @@ class PortPlayer(LeafSystem):
 
 def add_player(played: Playback, build: StationBuild) -> None:
     """Add a player to a station in place of its devices."""
-    player = build.builder.AddSystem(PortPlayer(played.tracks, played.inputs))
-    player.set_name("player")
+    player = build.builder.AddNamedSystem("player", PortPlayer(played.tracks, played.inputs))
     build.inputs |= {name: player.GetInputPort(name) for name in played.inputs}
     build.outputs |= {name: player.GetOutputPort(name) for name in played.tracks}

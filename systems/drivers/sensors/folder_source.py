@@ -14,6 +14,7 @@ from typing import Protocol, TypeVar
 
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
+from weldcal.systems.drivers.config import check_range
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceFault, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.stamps import UnixClock, unix_now
 
@@ -274,8 +275,7 @@ class FolderSource(Source[Datum]):
         if not folder:
             kind = f"Folder{device.capitalize()}"
             raise InputError(f"Write the folder of its files in the scenario: {device}: !{kind} {{folder: scans}}.")
-        if not 0.0 <= settle_s <= 60.0:
-            raise InputError(f"{device}.settle_s must be from 0 to 60, and it is {settle_s:g}.")
+        check_range(f"{device}.settle_s", settle_s, 0.0, 60.0)
         self.folder, self.name = Path(folder), f"{name} that writes into '{folder}'"
         self._read_file, self._remove_read, self._triggered = read, remove_read, bool(trigger)
         self._files = NewFiles(self.folder, suffixes, settle_s)

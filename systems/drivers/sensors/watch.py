@@ -138,7 +138,6 @@ class DeviceWatch(LeafSystem):
 def watch(build: StationBuild, device: SelfTestingDevice, name: str) -> None:
     """Let the station close a device, and let the robot's status show the device's faults."""
     build.closables.append(device)
-    watching = build.builder.AddSystem(DeviceWatch(device))
-    watching.set_name(f"{name}_watch")
-    build.builder.Connect(build.outputs["arm.status"], watching.GetInputPort("robot_status"))
-    build.outputs["arm.status"] = watching.GetOutputPort("status")
+    status = build.outputs["arm.status"]
+    watching = build.add(f"{name}_watch", DeviceWatch(device), "arm.status")
+    build.builder.Connect(status, watching.GetInputPort("robot_status"))

@@ -37,9 +37,8 @@ class WiredFingerCamera(FingerCameraConfig):
     latency_s: float = 0.0  # from the middle of the exposure to the arrival; with stamps: that of the earliest pictures
     exposure_ms: float | None = None  # null: as the camera has it
     gain: float | None = None
-    calibration: str = (
-        ""  # file of `weldcal finger calibrate`: its focal length, distortion and tag take the place of focal_px
-    )
+    # file of `weldcal finger calibrate`: its focal length, distortion and tag take the place of focal_px
+    calibration: str = ""
     silent_s: float = 0.5  # without a usable picture: a fault
     frozen_s: float = 0.5  # with identical pictures: a fault
     late_s: float = 0.5  # that a picture comes late: a fault
@@ -153,8 +152,5 @@ def add_camera(config: WiredFingerCamera, source: Source[Picture], build: Statio
     acquisition.time = cell_time(build)
     acquisition.start(start_s, first_frame=True)
     watch(build, acquisition, "finger_camera")
-    camera = build.builder.AddSystem(WiredPictures(acquisition))
-    camera.set_name("finger_camera")
-    build.inputs["finger_camera.streaming"] = camera.GetInputPort("streaming")
-    build.outputs["finger_camera.image"] = camera.GetOutputPort("image")
-    build.outputs["finger_camera.capture_time"] = camera.GetOutputPort("capture_time")
+    ports = (f"finger_camera.{port}" for port in ("streaming", "image", "capture_time"))
+    build.add("finger_camera", WiredPictures(acquisition), *ports)

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
-from weldcal.systems.drivers.config import ScannerConfig
+from weldcal.systems.drivers.config import ScannerConfig, check_range
 from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
 from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
 from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
@@ -68,14 +68,10 @@ class WiredScanner(ScannerConfig):
     def rules(self) -> Rules:
         """When this scanner is at fault. Raises InputError for a time that no scan takes."""
         low, high = SCAN_TIMEOUTS_S
-        if not low <= self.scan_timeout_s <= high:
-            raise InputError(
-                f"scanner.scan_timeout_s must be from {low:g} to {high:g}, and it is {self.scan_timeout_s:g}."
-            )
+        check_range("scanner.scan_timeout_s", self.scan_timeout_s, low, high)
         if self.streams:
             for name in ("silent_s", "late_s"):
-                if not 0.1 <= getattr(self, name) <= high:
-                    raise InputError(f"scanner.{name} must be from 0.1 to {high:g}, and it is {getattr(self, name):g}.")
+                check_range(f"scanner.{name}", getattr(self, name), 0.1, high)
             return Rules(silent_s=self.silent_s, frozen_s=self.silent_s, late_s=self.late_s)
         return Rules(late_s=float("inf"), answer_s=self.scan_timeout_s)
 
@@ -179,12 +175,7 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
     watch(build, acquisition, "scanner")
     if config.streams:
         clock = None if build.robot is None else build.robot.clock
-        stream = build.builder.AddSystem(WiredScanStream(acquisition, clock))
-        build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
-        build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
-        stream.set_name("scanner")
+        build.add("scanner", WiredScanStream(acquisition, clock), "scanner.streaming", "scanner.stream")
         return
-    sensor = build.builder.AddSystem(OnTrigger(acquisition, "scan", Scan, PERIOD_S, build.may_wait))
-    sensor.set_name("scanner")
-    build.inputs["scanner.trigger"] = sensor.GetInputPort("trigger")
-    build.outputs["scanner.scan"] = sensor.GetOutputPort("scan")
+    sensor = OnTrigger(acquisition, "scan", Scan, PERIOD_S, build.may_wait)
+    build.add("scanner", sensor, "scanner.trigger", "scanner.scan")

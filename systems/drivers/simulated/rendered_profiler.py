@@ -124,9 +124,8 @@ class RayFan:
         t = hit["t_hit"].numpy().astype(float)
         normal = hit["primitive_normals"].numpy().astype(float)
         number = hit["geometry_ids"].numpy().astype(np.int64)
-        dark = np.array([*self._dark, 1.0])[
-            np.minimum(number, len(self._dark))
-        ]  # a miss is the largest representable number
+        # a miss is the largest representable number
+        dark = np.array([*self._dark, 1.0])[np.minimum(number, len(self._dark))]
         t_ball, normal_ball = self._sphere(start, d)
         nearer = t_ball < t
         t, dark = np.where(nearer, t_ball, t), np.where(nearer, 0.0, dark)
@@ -284,18 +283,10 @@ def ApplyDriverConfig(config: RenderedProfiler, build: StationBuild) -> None:
         raise RuntimeError("the profiler's fixture is not in the simulated world")
     plant, builder = world.plant, build.builder
     flange = plant.GetBodyByName("flange", world.arm).index()
-    sensor = builder.AddSystem(
-        ProfilerSensor(config, fixture, flange, int(build.rng.integers(2**31)), plant.time_step())
-    )
-    sensor.set_name("profiler")
-    touch = builder.AddSystem(TouchSensor(pair, plant.time_step()))
-    touch.set_name("touch_sensor")
-    cheat = builder.AddSystem(CheatTorch(fixture, flange))
-    cheat.set_name("cheat_torch")
+    sensor = ProfilerSensor(config, fixture, flange, int(build.rng.integers(2**31)), plant.time_step())
+    build.add("profiler", sensor, "profiler.trigger", "profiler.profile")
+    touch = build.add("touch_sensor", TouchSensor(pair, plant.time_step()), "torch.touch")
+    cheat = build.add("cheat_torch", CheatTorch(fixture, flange), "cheat.torch")
     for system in (sensor, cheat):
         builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
     builder.Connect(plant.get_contact_results_output_port(), touch.GetInputPort("contact_results"))
-    build.inputs["profiler.trigger"] = sensor.GetInputPort("trigger")
-    build.outputs["profiler.profile"] = sensor.GetOutputPort("profile")
-    build.outputs["torch.touch"] = touch.GetOutputPort("touch")
-    build.outputs["cheat.torch"] = cheat.GetOutputPort("torch")

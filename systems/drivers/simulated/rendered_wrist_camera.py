@@ -107,14 +107,11 @@ def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
     )
     flange = view.frames[world.plant.GetBodyByName("flange", world.arm).index()]
     depth = DepthRenderCamera(core, DepthRange(_NEAR_M, _FAR_M))
-    sensor = builder.AddSystem(
-        RgbdSensor(flange, build.require(TabletTruth).X_FC, ColorRenderCamera(core, False), depth)
+    sensor = builder.AddNamedSystem(
+        "wrist_rgbd", RgbdSensor(flange, build.require(TabletTruth).X_FC, ColorRenderCamera(core, False), depth)
     )
-    sensor.set_name("wrist_rgbd")
-    camera = builder.AddSystem(WristCamera(config, int(build.rng.integers(2**31))))
-    camera.set_name("wrist_camera")
+    camera = WristCamera(config, int(build.rng.integers(2**31)))
+    build.add("wrist_camera", camera, "wrist_camera.trigger", "wrist_camera.picture")
     builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     builder.Connect(sensor.color_image_output_port(), camera.GetInputPort("color_image"))
     builder.Connect(sensor.depth_image_32F_output_port(), camera.GetInputPort("depth_image"))
-    build.inputs["wrist_camera.trigger"] = camera.GetInputPort("trigger")
-    build.outputs["wrist_camera.picture"] = camera.GetOutputPort("picture")

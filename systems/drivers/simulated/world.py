@@ -83,8 +83,9 @@ def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: l
 
     Gravity stays on: without any force on an arm at rest, the contact solver has no scale for its convergence test.
     """
-    feed_forward = builder.AddSystem(InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
-    feed_forward.set_name("gravity_compensation")
+    feed_forward = builder.AddNamedSystem(
+        "gravity_compensation", InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation)
+    )
     builder.Connect(plant.get_state_output_port(), feed_forward.get_input_port_estimated_state())
     split = builder.AddSystem(Demultiplexer([plant.num_actuated_dofs(m) for m in models]))
     builder.Connect(feed_forward.get_output_port_generalized_force(), split.get_input_port())
@@ -174,12 +175,12 @@ def build_world(
     moved = [m for m in (instance, tool_instance, second_arm, *fitted) if m is not None]
     compensate_gravity(builder, plant, moved)
     if tool_instance is not None:
-        rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
-        rest.set_name("tip_at_rest")
+        rest = builder.AddNamedSystem("tip_at_rest", ConstantVectorSource(np.zeros(6)))
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
     for k, model in enumerate(fitted):
-        still = builder.AddSystem(ConstantVectorSource(np.zeros(2 * plant.num_actuated_dofs(model))))
-        still.set_name(f"fittings_at_rest_{k}")
+        still = builder.AddNamedSystem(
+            f"fittings_at_rest_{k}", ConstantVectorSource(np.zeros(2 * plant.num_actuated_dofs(model)))
+        )
         builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(model))
     scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
     return SimulatedWorld(

@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
@@ -13,7 +14,7 @@ from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
 from weldcal.systems.drivers.ur.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
 from weldcal.systems.drivers.ur.set_points import ArcInputs, Level, apart
-from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
+from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, Limits, RobotSample
 from weldcal.systems.drivers.ur.wire.rtde_client import (
     DOUBLES,
     SET_POINTS,
@@ -159,29 +160,39 @@ def _without(text: str, mark: str) -> str:
     return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorkerConfig:
+    """The configuration that the cell passes to its worker. `arm` has the robot's own kinematics."""
+
+    host: str
+    arm: ArmModel
+    limits: Limits
+    parent: int
+    rate_hz: float = 250.0
+    upper_registers: bool = True
+    payload_kg: float = 0.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    process_output: int | None = None
+    arc_input: int | None = None
+    arc_fault_input: int | None = None
+    gas_output: int | None = None
+    gas_before_s: float = 0.0
+    gas_after_s: float = 0.0
+    levels: tuple[Level, ...] = ()
+    transport: str = NATIVE
+
+
 class ControllerStream:
     """The stream to and from the controller, the clock map and the newest complete package."""
 
-    def __init__(
-        self,
-        host: str,
-        *,
-        upper: bool,
-        pace: float,
-        arm: ArmModel,
-        output: int | None = None,
-        arc_inputs: ArcInputs | None = None,
-        gas: int | None = None,
-        levels: Sequence[Level] = (),
-        transport: str = NATIVE,
-    ) -> None:
-        self._host, self._levels = host, tuple(levels)
-        base = UPPER_OFFSET if upper else 0
-        self._output, self._arm, self._pace = output, arm, pace
-        self._script = guard_script(upper, output, gas, levels)
+    def __init__(self, config: WorkerConfig) -> None:
+        self._host, self._levels, output, levels = config.host, config.levels, config.process_output, config.levels
+        base = UPPER_OFFSET if config.upper_registers else 0
+        self._output, self._arm, self._pace = output, config.arm, config.limits.pace
+        self._script = guard_script(config.upper_registers, output, config.gas_output, levels)
         self._doubles = DOUBLES + (SET_POINTS if levels else 0)
-        self._arc_inputs = arc_inputs or ArcInputs()
-        self.clock = ClockMap(pace)
+        self._arc_inputs = ArcInputs(config.arc_input, config.arc_fault_input)
+        self.clock = ClockMap(self._pace)
         self._latch = f"output_int_register_{base + 12}"
         # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
         self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
@@ -195,13 +206,13 @@ class ControllerStream:
         ]
         names += [ANALOG_TYPES, *(name for pair in self._points for name in pair)] if levels else []
         try:
-            self._stream = self._connected(transport, names, base)
+            self._stream = self._connected(config.transport, names, base)
         except NotFinite as error:
             raise Refused(Fault.STATE_NOT_FINITE, reported_as(error.output)) from error
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
-        self._switch = None if output is None else self._off_switch(output, gas)
+        self._switch = None if output is None else self._off_switch(output, config.gas_output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
         self._sent: dict[float, float] = {}

@@ -227,6 +227,4 @@ def ApplyDriverConfig(config: UrTouchProbe, build: StationBuild) -> None:
     config.check()
     probe = ProbeInput(config, cell_time(build))
     watch(build, probe, "touch_probe")
-    system = build.builder.AddSystem(UrTouchProbeInput(probe))
-    system.set_name("touch_probe")
-    build.outputs["torch.touch"] = system.GetOutputPort("touch")
+    build.add("touch_probe", UrTouchProbeInput(probe), "torch.touch")

@@ -89,9 +89,8 @@ class ProfilerJob:
     edge: EdgeStage = dc.field(default_factory=EdgeStage)
     sphere: SphereStage = dc.field(default_factory=SphereStage)
     seam: SeamStage = dc.field(default_factory=SeamStage)
-    robot_sigma_mm: float = (
-        0.06  # per axis: error of the flange position that the controller reports, drawn at each pose
-    )
+    # per axis: error of the flange position that the controller reports, drawn at each pose
+    robot_sigma_mm: float = 0.06
     clearance_mm: float = 6.0  # nominal distance between torch or profiler and the scanned object
     near_mm: float = 72.0  # the depth range of the calibration
     far_mm: float = 105.0

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.config import NoDevice, check_range
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
 
@@ -98,8 +98,7 @@ def check_tablet(scenario: Scenario) -> None:
         )
     if tablet.ring_mm >= min(tablet.across_mm, tablet.down_mm):
         raise InputError("tablet.ring_mm must be smaller than the landmarks' spacing, or the rings overlap.")
-    if not 0.0 <= tablet.tilt_deg <= STEEPEST_DEG:
-        raise InputError(f"tablet.tilt_deg must be from 0 to {STEEPEST_DEG:g}, and it is {tablet.tilt_deg:g}.")
+    check_range("tablet.tilt_deg", tablet.tilt_deg, 0.0, STEEPEST_DEG)
     check_pen(tablet.pen)
 
 

@@ -16,7 +16,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background, BackgroundSystem
-from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
+from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice, check_range
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_root_anyhow
 from weldcal.systems.messages import JobCommand, Message, Scan
@@ -68,8 +68,7 @@ def check_touch(scenario: Scenario) -> None:
             raise InputError(f"touch.{name} must be a positive number, not {getattr(touch, name):g}.")
     if not FEWEST <= touch.points <= MOST:
         raise InputError(f"touch.points must be from {FEWEST} to {MOST}, not {touch.points}.")
-    if not 0.0 <= touch.turn_deg <= 45.0:
-        raise InputError(f"touch.turn_deg must be from 0 to 45, and it is {touch.turn_deg:g}.")
+    check_range("touch.turn_deg", touch.turn_deg, 0.0, 45.0)
 
 
 _COLUMN_M = 0.003  # points of the scan this near to a line along `up` show the face's height there

@@ -229,9 +229,8 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
             _check_clear(welder, way, X_BP, seed is not None)
             break
         except (SeamObstructed, SeamOutOfReach) as found:
-            problem = (
-                problem or found
-            )  # what is in the way at the first height, not that the arm does not reach a higher one
+            # what is in the way at the first height, not that the arm does not reach a higher one
+            problem = problem or found
             if share == HIGHER[-1] or isinstance(problem, SeamOutOfReach):
                 raise problem from found
     if lean and welder.workpiece is not None and X_BP is not None:

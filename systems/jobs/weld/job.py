@@ -167,8 +167,6 @@ class WeldJob(AddedJob):
     calibrator: IterativeCalibrator
     monitor: DriftMonitor | None
     welding: WeldingPorts
-    ports: JobPorts
-    maximum_time_s: float
     seams: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
@@ -260,16 +258,12 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         welding = _add_welding(wiring, spine, config, sequencer, status)
         monitor = add_watch(wiring, spine, sequencer, status, X_FR)
         wiring.feed("scanner.trigger", sequencer.GetOutputPort("scan_trigger"))
-        wiring.connect(
+        spine.serve(
             sequencer,
-            robot_status=spine.arm.status,
-            settled_goal=spine.arm.settled_goal,
-            position_measured=spine.arm.position,
             next_pose=chooser.GetOutputPort("next_pose"),
             calibration_status=status,
             planned_seam=welding.seam,
             servo_report=welding.report,
-            hold=spine.end,
             arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
         )
         state = sequencer.GetOutputPort("job_state")

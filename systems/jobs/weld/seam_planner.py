@@ -265,9 +265,8 @@ def plan_seam(
             check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
         felt = is_felt(planning.workpiece, planning.tool)
         at, others = added_variance(planning, found, seam, plan, known[-1][1])
-        part_m = (
-            found.sigma_m if found.across_m is None else found.across_m
-        )  # a turn about a ring moves it along itself
+        # a turn about a ring moves it along itself
+        part_m = found.sigma_m if found.across_m is None else found.across_m
         sigma_m = math.sqrt(np.mean(np.square(part_m)) + np.mean(others))
         summary = f"{found.summary}; with scanner and arm its sigma is {1e3 * sigma_m:.2f} mm"
         if not felt:

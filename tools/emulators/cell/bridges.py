@@ -52,9 +52,8 @@ class Bridge:
                 self._be_deaf()
                 self._ends.wait(LOOK_S)
                 continue
-            with contextlib.suppress(
-                OSError, InputError
-            ):  # what either side does to its connection, or a world that ends
+            # what either side does to its connection, or a world that ends
+            with contextlib.suppress(OSError, InputError):
                 client, _ = self._hear().accept()
                 with client, socket.create_connection(self._device, 5.0) as device:
                     self._pass_on(client, device)

@@ -23,9 +23,8 @@ from weldcal.tools.emulators.cell.physics import still, true_station
 
 POSE, DONE = "pose", "done"  # what the scanner says: it exposes now; its file lies in the folder
 SCAN_S = 0.5  # of the world, from the exposure to the file, at most
-FRAME_WAITS_S = (
-    0.05  # of the host in each frame: the world goes on slowly, and a cell that follows it sees no broken link
-)
+# of the host in each frame: the world goes on slowly, and a cell that follows it sees no broken link
+FRAME_WAITS_S = 0.05
 LIMIT_S = 20.0  # of the host for one scan; a scanner that has stopped is not waited for any longer
 EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
 PROFILED_S = 0.03  # of the copy's time, for a profiler

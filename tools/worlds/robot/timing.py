@@ -64,10 +64,10 @@ class Tap:
         if not self.command_times:
             return found
         self.ages.append(found.age_s)
-        if found.heard != self._heard:
+        if found.echo != self._heard:
             if self._heard >= 0:  # a link's first state may know of no command yet
-                self.echoes.append(found.echo_latency_s)
-            self._heard = found.heard
+                self.echoes.append(found.echo_latency)
+            self._heard = found.echo
         if self._stepped is not None:
             when, before, after = self._stepped
             if (found.qd[STEP_JOINT] - before) / (after - before) > 0.5:
