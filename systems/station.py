@@ -1,5 +1,7 @@
-"""Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or
-simulated."""
+"""Builds the station: arms, sensors and tools with fixed ports.
+
+The scenario's driver configs select real or simulated.
+"""
 
 import dataclasses as dc
 import inspect
@@ -288,8 +290,10 @@ def _make_station(
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
-    """Apply a single-arm driver to the second arm: it gets a world with this arm as its arm, and its ports are
-    renamed."""
+    """Apply a single-arm driver to the second arm.
+
+    It gets a world with this arm as its arm, and its ports are renamed.
+    """
     world = build.require(SimulatedWorld)
     assert world.second is not None
     own = dc.replace(

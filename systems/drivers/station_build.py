@@ -1,5 +1,7 @@
-"""The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to
-export."""
+"""The interface between drivers and the station builder.
+
+The DiagramBuilder, the station's parts and the ports to export.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -62,8 +64,9 @@ class PreparedRobot:
 
 @dataclass(kw_only=True)
 class StationBuild:
-    """Collects the ports that drivers add; `make_station` exports them under fixed names. `q_start` (6,) rad: the arm's
-    present configuration.
+    """Collects the ports that drivers add; `make_station` exports them under fixed names.
+
+    `q_start` (6,) rad: the arm's present configuration.
 
     `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's
     setup. `closables` are closed with the station.
@@ -82,8 +85,9 @@ class StationBuild:
 
     @property
     def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait
-        for it.
+        """Whether the Diagram may wait for a device.
+
+        It may not while it keeps the pace of a robot that does not wait for it.
 
         Nor while it follows a robot that waits for it: a device of that robot's world may need the robot's time to go
         on.

@@ -163,8 +163,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def read(self, *optional: str, **ports: Any) -> None:
-        """Declare further input ports under the inputs' names, each with a value of its type (a number: a vector of
-        one).
+        """Declare further input ports under the inputs' names, each with a value of its type (number: one-vector).
 
         A port among `optional` may stay open: then its value is the one given here.
         """

@@ -1,5 +1,7 @@
-"""Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process
-switch."""
+"""Builds the spine shared by all jobs.
+
+Pose recorder, mover, arbiter and limiter for each arm, operator hold, process switch.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -250,8 +252,10 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it;
-    `switch` outputs `process_on` and `arm_stopped`."""
+    """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it.
+
+    `switch` outputs `process_on` and `arm_stopped`.
+    """
 
     wiring: Wiring
     arms: tuple[SpineArm, ...]

@@ -1,5 +1,4 @@
-"""PortPlayer: outputs what a recording holds of a station's ports, each value at the moment of a tick at which it was
-seen."""
+"""Output what a recording holds of a station's ports, each value at the moment of a tick at which it was read."""
 
 from __future__ import annotations
 
@@ -32,8 +31,10 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """What a station plays back: tracks of its output ports, sizes of its input ports, and looks by question
-    (answers.py)."""
+    """What a station plays back.
+
+    Tracks of its output ports, sizes of its input ports, and looks by question (answers.py).
+    """
 
     tracks: Mapping[str, Track]
     inputs: Mapping[str, int]

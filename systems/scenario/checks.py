@@ -117,8 +117,10 @@ def check_numbers(config: Any, place: str = "") -> None:
 
 
 def _check_type(key: str, kind: Any, value: Any) -> None:
-    """Refuses a word where a number belongs: Drake's YAML reader converts plain types, and leaves an optional one as it
-    was."""
+    """Refuses a word where a number belongs.
+
+    Drake's YAML reader converts plain types, and leaves an optional one as it was.
+    """
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
     if value is None and NoneType not in kinds:
         raise InputError(f"{key} has no value; write one, or omit the key.")

@@ -1,5 +1,7 @@
-"""CellVisualizer: shows the weld job's estimates in Meshcat: view cone, clouds by residual, circles, uncertainty,
-seams, torch."""
+"""CellVisualizer: shows the weld job's estimates in Meshcat.
+
+View cone, clouds by residual, circles, uncertainty, seams, torch.
+"""
 
 from dataclasses import dataclass, field
 

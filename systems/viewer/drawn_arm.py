@@ -25,8 +25,9 @@ def add_drawn_arm(
     position_measured: OutputPort,
     surroundings: Surroundings,
 ) -> SceneGraph:
-    """Add a scene with arm, tool (tip at rest), table, its top's frame at `table` in B, and surroundings; frame: the
-    world is the base B.
+    """Add a scene with arm, tool (tip at rest), table, its top's frame at `table` in B, and surroundings.
+
+    Frame: the world is the base B.
 
     `position_measured` (6) rad sets the arm's pose. The scene has no dynamics, no contact and no rendered sensors.
     """

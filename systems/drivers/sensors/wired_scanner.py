@@ -1,5 +1,7 @@
-"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a
-stream."""
+"""What all scanners by wire share.
+
+Their configuration, the system that asks for scans, and the one that shows a stream.
+"""
 
 import dataclasses as dc
 import time
@@ -14,8 +16,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig, check_range
 from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
-from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
+from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.drivers.sensors.watch import OnTrigger, begin
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Scan, ScanStream, StreamedScan
@@ -163,16 +165,14 @@ def acquire(config: WiredScanner, source: Source[Cloud]) -> Acquisition[Cloud]:
     return Acquisition(source, config.rules(), kept=kept, latency_s=config.latency_s)
 
 
-def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild, start_s: float = 10.0) -> None:
+def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild) -> None:
     """Start the acquisition and add the scanner's system with its ports to the station.
 
     Raises:
         DeviceFault: the scanner does not answer.
     """
     acquisition = acquire(config, source)
-    acquisition.time = cell_time(build)
-    acquisition.start(start_s, first_frame=config.streams)
-    watch(build, acquisition, "scanner")
+    begin(build, acquisition, "scanner", first_frame=config.streams)
     if config.streams:
         clock = None if build.robot is None else build.robot.clock
         build.add("scanner", WiredScanStream(acquisition, clock), "scanner.streaming", "scanner.stream")

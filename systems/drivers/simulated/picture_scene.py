@@ -1,5 +1,7 @@
-"""A separate scene graph for a camera, and a stand that is knocked; its poses are updated only when a picture is
-taken."""
+"""A separate scene graph for a camera, and a stand that is knocked.
+
+Its poses are updated only when a picture is taken.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -131,8 +133,10 @@ class DisplacedStand(LeafSystem):
 
 
 def add_stand(builder: DiagramBuilder, scene: PictureScene, time_s: float, displacement: RigidTransform) -> FrameId:
-    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``; returns its frame in the camera's
-    scene."""
+    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``.
+
+    Returns its frame in the camera's scene.
+    """
     graph = scene.scene_graph
     source = graph.RegisterSource("stand")
     frame = graph.RegisterFrame(source, GeometryFrame("stand"))

@@ -21,8 +21,10 @@ MASS_KG = 0.9  # a choice: a torch and a small profiler together; it only loads 
 
 @dataclass(frozen=True, eq=False)
 class ProfilerTruth(Message):
-    """Ground truth of the simulation: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre
-    in B."""
+    """Ground truth of the simulation.
+
+    X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre in B.
+    """
 
     X_FS: RigidTransform
     p_FTip: Array
@@ -34,8 +36,7 @@ class ProfilerTruth(Message):
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFixture(Message):
-    """Ground truth and job, the pose of the straightedge, and the ray-cast objects: (mesh in B, darkness 0 to 1)
-    each."""
+    """Ground truth and job, the straightedge's pose, and the ray-cast objects: (mesh in B, darkness 0 to 1) each."""
 
     truth: ProfilerTruth
     X_BE: RigidTransform
@@ -54,8 +55,7 @@ class TouchPair(Message):
 
 
 def straightedge_mesh(length_m: float, width_m: float) -> TriMesh:
-    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, both sides bevelled
-    inwards."""
+    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, bevelled inwards."""
     section = np.array([[0.0, 0.0], [width_m, 0.0], [width_m - BEVEL_M, -BEVEL_M], [BEVEL_M, -BEVEL_M]])
     ends = [np.column_stack([np.full(4, x), section]) for x in (-0.5 * length_m, 0.5 * length_m)]
     triangles = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]]

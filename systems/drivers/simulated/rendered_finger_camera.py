@@ -47,8 +47,7 @@ class TagView:
         )
 
     def picture(self, X_FM: RigidTransform) -> Pixels:
-        """The grey picture (H, W) of the tag whose frame M (x right, y up, z out of the print) is at X_FM in the flange
-        frame."""
+        """The grey picture (H, W) of the tag at X_FM in the flange frame; M: x right, y up, z out of the print."""
         X_KM = self._X_KF @ X_FM
         found = np.full(self._size, round(255 * SOFT[1]), dtype=np.uint8)
         plate = np.round(self._pixels(X_KM, self._plate_M) * 2**_SUBPIXEL_BITS).astype(np.int32)
@@ -106,8 +105,10 @@ _NO_IMAGE = Image()
 
 @lru_cache(maxsize=4)
 def _noise_table(sigma: float) -> np.ndarray:
-    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one
-    look-up."""
+    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera.
+
+    A draw is one look-up.
+    """
     return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
 
 

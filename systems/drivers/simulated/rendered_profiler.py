@@ -209,8 +209,9 @@ class ProfilerSensor(LeafSystem):
 
 
 class TouchSensor(LeafSystem):
-    """Detects contact of the torch's tip with the sphere from the plant's contact results; it takes the place of the
-    sphere paper's microcontroller.
+    """Detects contact of the torch's tip with the sphere from the plant's contact results.
+
+    It takes the place of the sphere paper's microcontroller.
 
     .. pydrake_system::
 

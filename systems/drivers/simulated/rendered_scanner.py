@@ -209,8 +209,7 @@ class TrueScanner(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class MountedScanner:
-    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and what renders its
-    pictures."""
+    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and its renderer."""
 
     X_LC: RigidTransform
     device: ScannerPreset

@@ -24,8 +24,7 @@ _NEAR_M, _FAR_M = 0.05, 2.0
 
 @dc.dataclass(kw_only=True)
 class RenderedWristCamera(DriverConfig):
-    """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its
-    noise."""
+    """`!RenderedWristCamera`: the camera's nominal pose on the flange, the true pose's deviation, and its noise."""
 
     FOR: ClassVar[tuple[str, ...]] = ("wrist_camera",)
     SIMULATED: ClassVar[bool] = True

@@ -195,8 +195,10 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
 
 
 def _add_static_mode(config: StreamingScanner, build: StationBuild, mounted: MountedScanner) -> None:
-    """Add the mode that takes a scan per trigger: the device's own errors are those of the stream, its noise is
-    smaller."""
+    """Add the mode that takes a scan per trigger.
+
+    The device's own errors are those of the stream, its noise is smaller.
+    """
     own, at_rest = mounted.device.noise, get_scanner(config.static_preset).noise
     kept = ("scale_error", "gradient_per_m", "warp_m", "device")
     noise = dc.replace(at_rest, **{name: getattr(own, name) for name in kept})

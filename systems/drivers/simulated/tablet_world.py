@@ -1,5 +1,7 @@
-"""Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the
-table."""
+"""Adds the tablet job's bodies to the simulated world.
+
+Plate, camera and sprung pen on the flange, tablet on the table.
+"""
 
 import dataclasses as dc
 from dataclasses import dataclass

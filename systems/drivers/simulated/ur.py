@@ -157,8 +157,9 @@ class SpeedJointServo(LeafSystem):
 
 @compiled()
 def _follow(reference: Array, fault: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
-    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place; whether the arm starts
-    to move.
+    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place.
+
+    Whether the arm starts to move.
 
     ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
     """

@@ -50,8 +50,7 @@ SERVO_EFFORT = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)  # N m, of that arm: anot
 
 
 def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
-    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints'
-    torques."""
+    """Stiffness (6) N m / rad and damping (6) N m s / rad of joint servos, in proportion to the joints' torques."""
     share = arm.effort_limit / np.array(SERVO_EFFORT)
     return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
@@ -74,8 +73,10 @@ class Fittings(Protocol):
     """Further bodies of a scenario, on the flange and on the table."""
 
     def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
-        """Add them before the plant is finalised; returns the model instance whose springs have their rest position at
-        zero."""
+        """Add them before the plant is finalised.
+
+        Returns the model instance whose springs have their rest position at zero.
+        """
 
 
 def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:

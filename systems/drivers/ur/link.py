@@ -1,5 +1,7 @@
-"""The cell's side of the robot link: starts the worker, shares memory with it without blocking, and ends the
-program."""
+"""The cell's side of the robot link.
+
+Starts the worker, shares memory with it without blocking, and ends the program.
+"""
 
 from __future__ import annotations
 
@@ -69,8 +71,10 @@ class LinkState(Published):
 
 @lru_cache(maxsize=64)
 def status_of(codes: tuple[float, ...]) -> UrStatus:
-    """The state of the controller in words, from robot mode, safety mode, running (0 or 1), speed scaling, fault and
-    its detail."""
+    """The controller's state in words.
+
+    The numbers are robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail.
+    """
     robot_mode, safety_mode, running, scaling, code, detail = codes
     fault = Fault(int(code))
     return UrStatus(
@@ -163,8 +167,10 @@ class UrLink:
         self.command(np.zeros(6))
 
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no
-        sample."""
+        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds.
+
+        None where there is no sample.
+        """
         return self._memory.ring.at(host_time)
 
     def robot_time(self) -> float:

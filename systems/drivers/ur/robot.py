@@ -135,7 +135,8 @@ class Refused(Exception):
 def guard_script(
     upper_registers: bool, output: int | None = None, gas: int | None = None, levels: Sequence[Level] = ()
 ) -> str:
-    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share;
+    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share.
+
     `output` and `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired;
     `levels`: set points.
     """
@@ -155,8 +156,10 @@ def guard_script(
 
 
 def _without(text: str, mark: str) -> str:
-    """The script without the lines of a mark: a controller may refuse a program for the name of a function that it
-    never calls."""
+    """The script without the lines of a mark.
+
+    A controller may refuse a program for the name of a function that it never calls.
+    """
     return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
 
 
@@ -278,8 +281,9 @@ class ControllerStream:
         self._stream.send(command, *arguments, *points)
 
     def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
-        """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the
-        guard waits for a package.
+        """Read until the payload is the one that was set, in a thread.
+
+        The connection's end may take longer than the guard waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
         try:
@@ -347,8 +351,10 @@ class ControllerStream:
         )
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which the process was suspended, as silence of the robot; at most EXCUSED_S in a
-        row."""
+        """Do not count this time, in which the process was suspended, as silence of the robot.
+
+        At most EXCUSED_S in a row.
+        """
         seconds = min(seconds, max(EXCUSED_S - self._excused, 0.0))
         self._excused += seconds
         self._fresh_at += seconds
@@ -365,8 +371,9 @@ class ControllerStream:
             self._first_unheard = min(self._sent.values(), default=now)
 
     def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
-        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process, `armed` the set
-        points. Returns False where the program does not run.
+        """Send one velocity, numbered for the guard's watchdog.
+
+        A negative number enables the process, `armed` the set points. Returns False where the program does not run.
         """
         self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()

@@ -218,8 +218,9 @@ def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> t
 
 
 def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why: str) -> tuple[UrLink, str]:
-    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native
-    follows.
+    """The link over this transport, and why over this one.
+
+    Where `auto` took ur_rtde and it does not start, native follows.
 
     Raises:
         RobotRefused: the link does not start.
@@ -235,8 +236,9 @@ def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
-    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not
-    move.
+    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard.
+
+    The arm does not move.
 
     Raises:
         InputError: the scenario names no host, or a pace other than 1 or lockstep for a real robot.

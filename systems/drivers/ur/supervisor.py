@@ -294,8 +294,10 @@ class Supervisor:
         return Fault.NONE, 0.0
 
     def _set_points(self, robot: RobotSample) -> float | None:
-        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it
-        should."""
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package.
+
+        None: as it should.
+        """
         wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
         if not wrong:
             self._apart_since = None
@@ -304,8 +306,10 @@ class Supervisor:
         return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
-        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the
-        torch."""
+        """Whether an arc is reported that nothing asks for.
+
+        The input sticks or is noisy, or somebody else burns the torch.
+        """
         if robot.arc is None or robot.process_on is None:
             return False
         if robot.process_asked or robot.process_on:

@@ -1,5 +1,7 @@
-"""Touch probe at a digital input of a UR controller: `!UrTouchProbe` reads every RTDE sample, so that a touch has the
-joints of its sample."""
+"""Touch probe at a digital input of a UR controller.
+
+`!UrTouchProbe` reads every RTDE sample, so that a touch has the joints of its sample.
+"""
 
 import dataclasses as dc
 from collections import deque

@@ -169,8 +169,10 @@ class Worker:
             self._gas_on = on
 
     def _scaled(self, command: VelocityCommand, now: float, sample: RobotSample) -> VelocityCommand:
-        """The command with the factor that slows the arm while command or state is late, but not under a burning torch,
-        which goes out first."""
+        """The command with the factor that slows the arm while command or state is late.
+
+        Not under a burning torch, which goes out first.
+        """
         factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
         kept = command.process or self._config.limits.waits
         return command if kept else replace(command, scale=factor)
@@ -208,8 +210,7 @@ class Worker:
             self._phase = WorkerPhase.STOPPED
 
     def _await_the_end(self, robot: ControllerStream, period: float) -> None:
-        """Wait until the controller says that the program has ended, so that nothing of it runs on after this
-        process."""
+        """Wait until the controller's program has ended, so that nothing of it runs on after this process."""
         until = time.monotonic() + ENDS_S / self._config.limits.pace
         while (now := time.monotonic()) < until and robot.sample(now).runtime_state in (PLAYING, STOPPING):
             time.sleep(period)

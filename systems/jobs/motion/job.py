@@ -1,5 +1,4 @@
-"""The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a
-cube."""
+"""The motion job: calibrate a streaming scanner and its clock, or watch it, while the flange moves in a cube."""
 
 import dataclasses as dc
 from pathlib import Path
@@ -73,8 +72,7 @@ _TRIES = 40  # leans drawn for a corner
 
 @dc.dataclass(frozen=True, eq=False)
 class MotionPlanned:
-    """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched,
-    if anything."""
+    """Joints (6,) rad of the corners, the scanner's delay (s) by its data sheet, and what is watched, if anything."""
 
     corners: tuple[Array, ...]
     q_home: Array
@@ -243,8 +241,9 @@ class MotionCalibrationJob(Job[MotionPlanned]):
 def plan_corners(
     scenario: Scenario, station: Station, job: MotionJob, q_home: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Joint angles (6,) rad that bring the feature to the cube's corners, leaning another way at each, with free moves
-    between all of them.
+    """Joints (6,) rad that bring the feature to the cube's corners, with free moves between all of them.
+
+    The feature leans another way at each corner.
 
     Raises:
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
@@ -274,8 +273,10 @@ def plan_corners(
 def facing(
     p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel, X_FR: RigidTransform | None = None
 ) -> RotationMatrix:
-    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m, turned about its
-    axis as near to that at home as can be."""
+    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m.
+
+    It is turned about its axis as near to that at home as can be.
+    """
     z = X_BC.translation() - p
     z = z / np.linalg.norm(z)
     x_home = (forward_kinematics(arm, q_home) @ (X_FR or RigidTransform())).rotation().matrix()[:, 0]

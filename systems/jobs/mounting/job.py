@@ -67,8 +67,7 @@ class MountingFitConfig:
 
 
 class MountingCalibrator(BackgroundSystem):
-    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all
-    observations.
+    """Fits the circle in each scan near its prediction, and solves the mounting's equation with all observations.
 
     .. pydrake_system::
 
@@ -156,8 +155,10 @@ def digest(
 def next_best(
     belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
-    point most; None where all were visited."""
+    """The unvisited planned pose that reduces the expected error at the work point most.
+
+    All are reachable, visible and clear; None where all were visited.
+    """
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None
@@ -274,8 +275,10 @@ class MountingCalibrationJob(Job[MountingPlanned]):
 
 
 def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """The scene as known before the first scan, from drawings and rough measurements; and the dimensions of the
-    circle."""
+    """The scene as known before the first scan, from drawings and rough measurements.
+
+    And the dimensions of the circle.
+    """
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")

@@ -1,5 +1,7 @@
-"""Configuration of the profiler job: nominal torch, straightedge and sphere, their deviations, and the stages in
-order."""
+"""Configuration of the profiler job.
+
+Nominal torch, straightedge and sphere, their deviations, and the stages in order.
+"""
 
 import dataclasses as dc
 
@@ -79,8 +81,10 @@ class SeamStage:
 
 @dc.dataclass(kw_only=True)
 class ProfilerJob:
-    """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere
-    stage."""
+    """The stages of the job: edge, sphere and seam in this order.
+
+    The seam stage uses the result of the sphere stage.
+    """
 
     stages: list[str] = dc.field(default_factory=lambda: ["edge", "sphere", "seam"])
     torch: Torch = dc.field(default_factory=Torch)

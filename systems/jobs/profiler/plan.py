@@ -41,8 +41,10 @@ FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig i
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanningContext:
-    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at
-    X_BP."""
+    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B.
+
+    The nominal workpiece at X_BP.
+    """
 
     arm: ArmModel
     job: ProfilerJob
@@ -105,8 +107,9 @@ class PlanningContext:
         return lowest > self.table_z_m and gap > 0.0
 
     def _keeps_gap(self, q_a: Array, q_b: Array, least_m: float) -> bool:
-        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space; from each checked
-        configuration on by no more than what they have left there.
+        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space.
+
+        From each checked configuration on by no more than what they have left there.
         """
         n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
         rig, _ = rig_points(self.p_FTip, self.X_FS)
@@ -136,8 +139,7 @@ class PlanningContext:
         return np.array(q).reshape(-1, 6), np.array(which, dtype=np.intp)
 
     def route(self, q_from: Array, goals: Array) -> list[tuple[Array, int]]:
-        """A route through all goals (n, 6), each time to the nearest remaining one: (joints, goal's index or -1 for
-        home).
+        """A route through all goals (n, 6), each time to the nearest one left: (joints, goal's index or -1: home).
 
         Raises:
             InputError: a goal has no clear move, not even from home.
@@ -233,8 +235,9 @@ class Goal(Message):
 
 
 def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
-    """Plan the scans of the straightedge: those that minimise the predicted covariance, and held-out ones among the
-    rest.
+    """Plan the scans of the straightedge.
+
+    Those that minimise the predicted covariance, and held-out ones among the rest.
 
     Raises:
         InputError: too few poses are reachable and clear.
@@ -282,8 +285,9 @@ def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: Sph
 
 
 def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Goal]:
-    """Plan touches at points spread over the sphere's upper part, with a different inclination and rotation of the
-    torch at each.
+    """Plan touches at points spread over the sphere's upper part.
+
+    The torch has a different inclination and rotation at each.
 
     Raises:
         InputError: too few of them can be reached.
@@ -317,8 +321,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
 
 
 def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
-    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to the deepest place of a
-    touch."""
+    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to a touch's deepest place."""
     stage, X_FP = planning.job.sphere, RigidTransform(planning.p_FTip)
     way = 1e-3 * (stage.gap_mm + stage.deepest_mm) * way
     X_BP = forward_kinematics(planning.arm, q) @ X_FP
@@ -330,8 +333,7 @@ def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
 
 
 def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
-    """Plan the profiler's passes along the nominal seam, perpendicular to the plate, with the laser line across the
-    groove."""
+    """Plan the profiler's passes along the nominal seam, square to the plate, the laser line across the groove."""
     assert planning.cad is not None
     assert planning.X_BP is not None
     stage = planning.job.seam

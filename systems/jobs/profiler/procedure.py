@@ -1,5 +1,4 @@
-"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along
-it."""
+"""Scan the edge, scan and touch the sphere, scan along the groove, then move the torch along it."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar

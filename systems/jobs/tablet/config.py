@@ -32,8 +32,7 @@ class PenConfig:
 
 @dc.dataclass(kw_only=True)
 class TabletConfig:
-    """`tablet:` nominal pose of the page (first landmark, x to the right, y down the page, z into it), and the
-    motion."""
+    """`tablet:` the page's nominal pose (first landmark, x right, y down the page, z into it), and the motion."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.60, 0.045, 0.010])
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, 0.0])
@@ -124,8 +123,10 @@ class WristPicture(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class TabletTouch(Message):
-    """One touch as the page records it: position (2,) px from the first landmark, to a tenth; `sequence` 0 before the
-    first."""
+    """One touch as the page records it: position (2,) px from the first landmark, to a tenth.
+
+    `sequence` 0 before the first.
+    """
 
     sequence: int = 0
     time: float = -np.inf

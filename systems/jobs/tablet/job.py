@@ -50,8 +50,10 @@ def camera_of(scenario: Scenario) -> RenderedWristCamera:
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of
-    reach."""
+    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included.
+
+    Raises InputError where out of reach.
+    """
     found = inverse_kinematics(arm, X_BF)
     if len(found) == 0:
         raise InputError("The arm cannot reach the tablet at its nominal pose; move it nearer in the scenario.")

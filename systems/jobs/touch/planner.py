@@ -80,8 +80,10 @@ Joints = Array
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlace(Message):
-    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal
-    in the base."""
+    """A place to touch: joints above it, its scanned plane, and its point and outward normal in the base.
+
+    The plane is raw, in the camera's frame, with a sigma in m.
+    """
 
     q_above: Joints
     p_C: Array
@@ -102,8 +104,10 @@ class PlannedTouches(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlanning:
-    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's
-    numbers."""
+    """What touches are planned from.
+
+    Part, tool and arm as for a seam, the calibration to judge, and the job's numbers.
+    """
 
     seam: SeamPlanning
     X_BC: RigidTransform
@@ -186,8 +190,10 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
 
 
 def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
-    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the
-    sigma, m."""
+    """Plane of the face on the line through p_B along ``up``.
+
+    Point and normal towards the scanner as scanned, and the sigma, m.
+    """
     away = points_B - p_B
     height = away @ up
     column = (np.linalg.norm(away - height[:, None] * up, axis=1) < _COLUMN_M) & (np.abs(height) < 0.03)

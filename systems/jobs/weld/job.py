@@ -64,8 +64,10 @@ def add_stream(
     queue: FrameQueue,
     status: OutputPort,
 ) -> tuple[OutputPort, OutputPort]:
-    """Add a queue of the streaming scanner's frames and an estimator called `name`; returns its estimates, and the
-    queue's frames."""
+    """Add a queue of the streaming scanner's frames and an estimator called `name`.
+
+    Returns its estimates, and the queue's frames.
+    """
     scenario, station = wiring.scenario, wiring.station
     wiring.add("frame_queue", queue)
     estimator = wiring.add(
@@ -338,8 +340,10 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
 ) -> WeldingPorts:
-    """Add seam planner, deformation estimator, servo and guard; constant sources replace them in a cell without a
-    tool."""
+    """Add seam planner, deformation estimator, servo and guard.
+
+    Constant sources replace them in a cell without a tool.
+    """
     station, scenario = wiring.station, wiring.scenario
     tool, spec = station.tool, scenario.workpiece
     if (

@@ -143,8 +143,10 @@ class RtdeProbe:
         return self._line.release()
 
     def grant(self, names: Sequence[str]) -> int | None:
-        """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not
-        free."""
+        """Claim these inputs for `write`, and start.
+
+        Returns the recipe's number, or None where one of them is not free.
+        """
         payload = self._request(_INPUTS, ",".join(names).encode())
         if {IN_USE, NOT_FOUND} & set(self._types(payload, len(names))):
             return None

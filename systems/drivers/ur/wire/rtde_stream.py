@@ -1,5 +1,6 @@
-"""The stream of packages between the worker and the controller: the newest outputs are read, the command registers
-written.
+"""The stream of packages between the worker and the controller.
+
+The newest outputs are read, the command registers written.
 
 One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_client`.
 """
@@ -22,8 +23,9 @@ HEADER = struct.Struct(">HB")
 
 
 class RtdeStream:
-    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed; without `inputs`
-    it only reads.
+    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed.
+
+    Without `inputs` it only reads.
 
     Raises:
         RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is
