@@ -222,10 +222,9 @@ def _make_station(
     world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
         setup = WorldSetup() if set_up_world is None else set_up_world(scenario, rng, real, X_BP)
-        true_arm, true_second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
-        if true_second is not None:
-            of_second = scenario.robot_2.true_arm(true_second.arm, true_second.q_start, rng)
-            true_second = dc.replace(true_second, arm=of_second)
+        true_arm, second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
+        if second is not None:
+            second = dc.replace(second, arm=scenario.robot_2.true_arm(second.arm, second.q_start, rng))
         world = build_world(
             builder,
             true_arm,
@@ -235,13 +234,8 @@ def _make_station(
             table=table_in_base(scenario),
             workpiece=real,
             X_BP=X_BP,
-            fittings=setup.fittings,
-            second=true_second,
-            foot=setup.foot,
-            profiler=setup.profiler,
-            time_step_s=setup.time_step_s,
+            setup=dc.replace(setup, second=second),
             surroundings=surroundings,
-            contacts_read=setup.contacts_read,
         )
         build.parts = (world, *setup.parts)
     X_LC = None
@@ -270,7 +264,6 @@ def _make_station(
     _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
     diagram.set_name("station")
-    second = None if setup.second is None else setup.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background: Background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
     if played is not None:
@@ -282,7 +275,7 @@ def _make_station(
         cad=cad,
         truth=truth,
         world=world,
-        second=second,
+        second=None if setup.second is None else setup.second.arm,
         background=background,
         devices=tuple(opened),
         surroundings=surroundings,

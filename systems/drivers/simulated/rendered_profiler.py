@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import GeometryId
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
@@ -14,7 +15,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.config import DriverConfig
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
@@ -222,9 +223,9 @@ class TouchSensor(LeafSystem):
         - touch
     """
 
-    def __init__(self, pair: TouchPair, plant_period_s: float, period_s: float = 0.004) -> None:
+    def __init__(self, pair: frozenset[GeometryId], plant_period_s: float, period_s: float = 0.004) -> None:
         super().__init__()
-        self._pair, self._step = {pair.tip, pair.ball}, plant_period_s
+        self._pair, self._step = pair, plant_period_s
         self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
         self._touch = self.DeclareAbstractState(AbstractValue.Make(TorchTouch()))
         self.DeclareStateOutputPort("touch", self._touch)

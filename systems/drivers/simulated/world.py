@@ -5,7 +5,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties, Box, ProximityProperties, SceneGraph
+from pydrake.geometry import (
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Box,
+    GeometryId,
+    ProximityProperties,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -38,7 +45,7 @@ from weldcal.systems.bodies.tool import (
     show,
 )
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, add_fixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 
@@ -66,7 +73,7 @@ class SimulatedWorld(Message):
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
-    touch_pair: TouchPair | None = None
+    touch_pair: frozenset[GeometryId] | None = None  # whose contact counts as a touch
 
 
 class Fittings(Protocol):
@@ -77,6 +84,23 @@ class Fittings(Protocol):
 
         Returns the model instance whose springs have their rest position at zero.
         """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorldSetup:
+    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
+
+    `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
+    `contacts_read`: a device reads the plant's contact results, which are then those of its last step.
+    """
+
+    fittings: Sequence[Fittings] = ()
+    second: PlacedArm | None = None
+    foot: BaseCircle | None = None
+    profiler: ProfilerFixture | None = None
+    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
+    parts: Sequence[object] = ()
+    contacts_read: bool = False
 
 
 def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
@@ -104,29 +128,23 @@ def build_world(
     table: RigidTransform,
     workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
-    fittings: Sequence[Fittings] = (),
-    profiler: ProfilerFixture | None = None,
-    time_step_s: float = 0.002,
-    second: PlacedArm | None = None,
-    foot: BaseCircle | None = None,
-    surroundings: Surroundings | None = None,
-    contacts_read: bool = False,
+    setup: WorldSetup,
+    surroundings: Surroundings,
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
     Gravity pulls against the arm's `up`. `table` is the pose in B of the table's top, z up.
     A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
     Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
-    `contacts_read`: a device reads the plant's contact results, which are then those of its last step.
-    `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
     """
+    profiler, second, foot = setup.profiler, setup.second, setup.foot
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
-            time_step=time_step_s,
+            time_step=setup.time_step_s,
             contact_model="hydroelastic" if profiler is None else "point",
             # A plant with sampled ports steps in an unrestricted update: at each step Drake would copy the state of the
             # whole Diagram.
-            use_sampled_output_ports=contacts_read,
+            use_sampled_output_ports=setup.contacts_read,
             # With `sap` the tip's rest position would depend on the sliding speed
             discrete_contact_approximation="lagged",
         ),
@@ -150,8 +168,7 @@ def build_world(
         reach = np.abs(workpiece.mesh.transformed(table.inverse() @ X_BP).bounds[:, :2]).max(axis=0)
         length, width = (max(least, 2.0 * float(r) + 0.2) for least, r in zip(TABLE_M, reach, strict=True))
     show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(length, width, 0.04), "table", TABLE)
-    if surroundings is not None:
-        add_surroundings(plant, surroundings)
+    add_surroundings(plant, surroundings)
     if workpiece is not None and X_BP is not None:
         show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
         rigid = ProximityProperties()
@@ -161,7 +178,7 @@ def build_world(
             plant.RegisterCollisionGeometry(
                 world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
             )
-    fitted = [fitting.add(plant, instance) for fitting in fittings]
+    fitted = [fitting.add(plant, instance) for fitting in setup.fittings]
     stiffness, damping = servo_gains(arm)
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
@@ -194,19 +211,3 @@ def build_world(
         second=second_arm,
         touch_pair=touch_pair,
     )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class WorldSetup:
-    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
-
-    `contacts_read`: a device reads the plant's contact results.
-    """
-
-    fittings: Sequence[Fittings] = ()
-    second: PlacedArm | None = None
-    foot: BaseCircle | None = None
-    profiler: ProfilerFixture | None = None
-    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
-    parts: Sequence[object] = ()
-    contacts_read: bool = False

@@ -9,7 +9,6 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
-from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.arc import find_arc
@@ -46,7 +45,7 @@ class TakenProfile(Message):
 class EdgeFound(Message):
     """X_FS from the edge; scans without an edge.
 
-    Held-out scans: distance from the edge (n,) mm, whitened residuals (n, 2).
+    Held-out scans: distance from the edge (n,) mm.
     """
 
     estimate: EdgeEstimate
@@ -54,7 +53,6 @@ class EdgeFound(Message):
     points: Array
     lost: int
     held_out_mm: Array
-    held_out_sigmas: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +126,11 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     poses, points = flange_poses(arm, seen["scan"][0]), np.array(seen["scan"][1])
     e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)
     others = flange_poses(arm, seen["held_out"][0])
-    state = EdgeState(e.rotation, e.translation, e.point, e.direction)
-    expected, J, by_robot = predicted(state, others)
     held_out = np.array(seen["held_out"][1]).reshape(-1, 2)
-    off = held_out - expected
-    r, _ = whitened(measurement_covariance(by_robot, robot, sigmas), off, J)
     at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, held_out)) + others.translation
     away = at - e.point
     away -= np.outer(away @ e.direction, e.direction)
-    return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
+    return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1))
 
 
 def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -93,10 +93,6 @@ class PlanningContext:
             gaps.append(_to_box(p, self.X_BP, [-0.5 * x, -0.5 * y, -z], [0.5 * x, 0.5 * y, 0.0]))
         return float((np.min(gaps, axis=0) - radii).min())
 
-    def joints(self, X_BF: RigidTransform, q_near: Array) -> Array | None:
-        """The inverse kinematics solution nearest to `q_near`; None: out of reach."""
-        return nearest_solution(self.arm, X_BF, q_near)
-
     def clear_way(self, q_a: Array, q_b: Array) -> bool:
         """Whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
         if not self._keeps_gap(q_a, q_b, 0.5e-3 * self.job.clearance_mm):
@@ -132,7 +128,7 @@ class PlanningContext:
             X = RigidTransform(np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]]))
             if self.gap(X) < 1e-3 * self.job.clearance_mm:
                 continue
-            found = self.joints(X, self.q_home)
+            found = nearest_solution(self.arm, X, self.q_home)
             if found is not None:
                 q.append(found)
                 which.append(k)
@@ -159,10 +155,6 @@ class PlanningContext:
                 "Too many of the profiler's poses have no clear move: place the objects farther apart in profiler_job."
             )
         return way
-
-    def known(self, **changes: object) -> PlanningContext:
-        """A copy with updated values."""
-        return replace(self, **changes)  # type: ignore[arg-type]
 
 
 def _to_box(p: Array, X: RigidTransform, low: list[float], high: list[float]) -> Array:
@@ -306,7 +298,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
             continue
         tip = planning.center + (planning.radius_m + 1e-3 * stage.gap_mm) * n
         X = RigidTransform(R, tip - R.multiply(planning.p_FTip))
-        found = planning.joints(X, planning.q_home)
+        found = nearest_solution(planning.arm, X, planning.q_home)
         if found is not None and planning.gap(X) > 0.5e-3 * stage.gap_mm and _descends(planning, found, -n):
             q.append(found)
             normals.append(n)
@@ -420,7 +412,7 @@ def _along(
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
-    first = planning.joints(flange[0], planning.q_home)
+    first = nearest_solution(planning.arm, flange[0], planning.q_home)
     if first is None:
         raise InputError("The arm cannot reach the seam at its nominal pose: move the workpiece nearer.")
     X_FP = RigidTransform(planning.p_FTip)
@@ -434,7 +426,7 @@ def _along(
     )
     joints = check_path(planning.arm, first, [motion])[0].q
     raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]
-    above = planning.joints(raised, joints[0])
+    above = nearest_solution(planning.arm, raised, joints[0])
     ways = [] if above is None else [Goal("via", above)]
     if above is not None and not planning.clear_way(q_from, above):
         ways = [Goal("via", planning.q_home), *ways]
