@@ -34,8 +34,10 @@ FULL_PACE = 1.0  # a controller's time is real time; only an emulated one has an
 STILL_RAD_S = 1e-9  # rounding of a zero command: in a frame of 2 ms a joint turns 2e-12 rad
 # one period of the commands: a later velocity is replaced by the next one before the robot uses it
 CATCHES_UP_S = 0.004
-OF_WORKER = ("rate_hz", "payload_kg", "process_output", "arc_input", "arc_fault_input")
-OF_WORKER += ("gas_output", "gas_before_s", "gas_after_s")
+OF_WORKER = (
+    *("rate_hz", "payload_kg", "process_output", "arc_input", "arc_fault_input"),
+    *("gas_output", "gas_before_s", "gas_after_s"),
+)
 """Keys of the scenario that the worker takes as they are."""
 N_OUTPUTS = 8
 

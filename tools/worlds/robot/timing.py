@@ -39,7 +39,7 @@ class Tap:
     motions: array[float] = field(default_factory=lambda: array("d"))
     state_now: LinkState | None = None
     starts: list[int] = field(default_factory=lambda: [0])  # how many commands had been sent when a link began
-    _heard: int = -1
+    _heard: float = -1.0
     _wanted: float = 0.0
     _stepped: tuple[float, float, float] | None = None  # when, from, to
 
