@@ -123,8 +123,7 @@ def _build(
         add_cameras(wiring, added.ports, added.view(), Views() if live is None else live.views)
         period_s = 1.0 / scenario.visualization.recording_fps
         params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period_s)
-        visualizer = builder.AddSystem(MeshcatVisualizer(wiring.meshcat, params))
-        visualizer.set_name("meshcat_visualizer")
+        visualizer = builder.AddNamedSystem("meshcat_visualizer", MeshcatVisualizer(wiring.meshcat, params))
         builder.Connect(wiring.out("query_object"), visualizer.query_object_input_port())
     logs = {name: LogVectorOutput(port, builder, LOG_PERIOD_S) for name, port in added.ports.logged.items()}
     for name, sink in logs.items():

@@ -44,8 +44,7 @@ def no_progress(stage: str, fraction: float) -> None:
 
 @dataclass(kw_only=True)
 class Run(Generic[JobOf]):
-    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase
-    began.
+    """One run of a cell: final root context, scans by label, and (simulated, wall) seconds at each phase's start.
 
     `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
     None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before

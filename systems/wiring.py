@@ -18,8 +18,10 @@ AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Wiring:
-    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers; `operator` may hold
-    and end the run (None: a recording is played back).
+    """A cell under construction.
+
+    `meshcat` is the viewer, or None; `seed` seeds all random numbers; `operator` may hold and end the run (None: a
+    recording is played back).
 
     `read` and `driven` are the ports of the station that the cell reads, and the sources of those that it drives, by
     name.
@@ -36,8 +38,7 @@ class Wiring:
 
     def add(self, name: str, system: AnySystem) -> AnySystem:
         """Add a system under its name."""
-        system.set_name(name)
-        self.builder.AddSystem(system)
+        self.builder.AddNamedSystem(name, system)
         return system
 
     def connect(self, system: LeafSystem, **sources: OutputPort) -> None:

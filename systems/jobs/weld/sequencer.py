@@ -1,5 +1,7 @@
-"""JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract,
-hold."""
+"""JobSequencer: the state machine of the weld job.
+
+Home, calibrate, verify, scan, plan, approach, weld, retract, hold.
+"""
 
 import dataclasses as dc
 from collections.abc import Callable
@@ -233,8 +235,10 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return self.go(s, now, phase, now.next_pose.q)
 
     def _digested(self, s: JobState, now: JobInputs) -> JobState:
-        """Continue after each calibration scan: more poses, verification, or hold where the required error is not
-        reached."""
+        """Continue after each calibration scan.
+
+        More poses, verification, or hold where the required error is not reached.
+        """
         status = now.calibration_status
         if status.sequence < s.trigger:
             return s

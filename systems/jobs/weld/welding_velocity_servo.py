@@ -1,5 +1,4 @@
-"""WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip
-deformation."""
+"""Compute the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
 import dataclasses as dc
 from collections.abc import Sequence
