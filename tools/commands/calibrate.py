@@ -16,7 +16,7 @@ from weldcal.calibration.calibrate import calibrate as calibrate_observations
 from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_carried, is_motion
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result, software_version
+from weldcal.calibration.data.results import CalibrationResult, IcpRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
@@ -36,7 +36,7 @@ from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.cli.discovery import other_command
+from weldcal.tools.cli.discovery import on_demand, other_command
 from weldcal.tools.cli.options import (
     MOTION,
     Call,
@@ -48,10 +48,10 @@ from weldcal.tools.cli.options import (
     option,
     switch,
 )
-from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import (
+    Algorithm1Outcome,
     CalibrationReport,
     calibration_report,
     error_summary,
@@ -228,7 +228,7 @@ def calibrate_dataset(
         tell("comparing the visible arm", 0.7)
         seen, start = see_with_arm(data, seen, standard, robot or data.header.robot, seed=seed)
     data = seen.data or data
-    observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
+    observations, fits, refused = list(seen.observations), seen.fits, list(seen.refused)
     few = len(observations) < ENOUGH
     confirmed = len(seen.patterns) >= _CONFIRMING
     with examined_where_refused(Path(out), data, seen, standard, seed):
@@ -266,12 +266,12 @@ def calibrate_dataset(
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
+    curve = convergence(inliers, orders=8, seed=seed, solve=solve)
+    algorithm1: Algorithm1Outcome | None = None
+    icp: tuple[IcpRecord, ...] = ()
     if compare:
         tell("Algorithm 1 for comparison", 0.8)
-    algorithm1, verifier, icp = compare_algorithm1(
-        observations, inliers if compare else [], clouds, fits, standard, seed
-    )
-    curve = convergence(inliers, verifier, orders=8, seed=seed, solve=solve)
+        algorithm1, icp = on_demand("compare_algorithm1")(seen, inliers, curve.counts, standard, seed)
     warnings = [*found.warnings, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(

@@ -23,7 +23,7 @@ from weldcal.calibration.data.results import (
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence, bootstrap_interval, mean_interval
+from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -89,6 +89,7 @@ class Algorithm1Outcome:
 
     ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at
     the flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
+    ``curve``: what it reports (orders, k) and its true errors (rows, k), m, at the counts of the report's convergence.
     """
 
     verification: str
@@ -98,7 +99,7 @@ class Algorithm1Outcome:
     at_verification_mm: float
     unseen: tuple[str, ...]
     shares: tuple[float, ...]
-    run: Algorithm1Run
+    curve: tuple[Array, Array]
 
     @property
     def sentence(self) -> str:
@@ -406,8 +407,10 @@ def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
     figure, axes = subplots(8.2, 3.9)
     _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on unused scans")
-    _band(axes, c.counts, 1e3 * c.figure_true, TRUTH, "Algorithm 1, on unused scans")
-    _band(axes, c.counts, 1e3 * c.figure, THEIRS, "figure reported by Algorithm 1")
+    if report.algorithm1 is not None:
+        figure_m, true_m = report.algorithm1.curve
+        _band(axes, c.counts, 1e3 * true_m, TRUTH, "Algorithm 1, on unused scans")
+        _band(axes, c.counts, 1e3 * figure_m, THEIRS, "figure reported by Algorithm 1")
     axes.set(xlabel="number of scans", ylabel="error at the flange, mm")
     axes.set_ylim(bottom=0.0)
     if axes.lines:

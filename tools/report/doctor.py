@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis
+from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
+from weldcal.models.errors import WeldcalError
 
 CALIBRATION = "calibration.yaml"
 CHECKED = (
@@ -79,6 +81,25 @@ def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
         tuple(NamedCause(c.name, round(c.confidence, 3), *_WORDS[c.name](c)) for c in diagnosis.causes[:most]),
         diagnosis.n,
         spread if spread == spread else None,
+    )
+
+
+_NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "too few scans")
+"""Causes that the solver names itself, or that are none."""
+
+
+def name_cause(problem: WeldcalError, case: DoctorCase) -> None:
+    """Add the likely cause, its evidence and its remedy to the sentence of a refusal, unless the sentence names it."""
+    causes = worded("", diagnose(case), most=1).causes
+    if not causes or causes[0].name in _NAMED_ALREADY:
+        return
+    cause = causes[0]
+    problem.args = (
+        (
+            f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence}"
+            f" {cause.next}"
+        ),
+        *problem.args[1:],
     )
 
 

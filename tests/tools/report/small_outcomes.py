@@ -70,7 +70,7 @@ RESULT = CalibrationResult(
 def calibrate() -> Made:
     """`calibrate` of ten scans within its tolerance, with a warning."""
     counts = np.arange(4, 10)
-    curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
+    curve = Convergence(counts, 1e-4 * np.ones((2, len(counts))))
     report = CalibrationReport(
         result=RESULT,
         estimate=ESTIMATE,
