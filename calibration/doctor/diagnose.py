@@ -86,6 +86,11 @@ def _misreadings(case: DoctorCase) -> Iterator[tuple[str, str, DoctorCase, Docto
         yield cause, words, case, case.with_poses(pose(R, case.X_BF[:, :3, 3]))
     words = "the poses are the base in the flange, the inverse of what is expected"
     yield "poses inverted", words, case, case.with_poses(inverse(case.X_BF))
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        swapped = case.X_BF.copy()
+        swapped[:, [first, second], 3] = swapped[:, [second, first], 3]
+        words = f"the columns {'xyz'[first]} and {'xyz'[second]} of the poses are exchanged"
+        yield "position columns exchanged", words, case, case.with_poses(swapped)
     flip = np.array([-1.0, 1.0, 1.0])  # one mirror stands for all: the others are turned ones
     words = "the scanner's frame is left-handed: one of its axes is mirrored"
     yield "scanner axes mirrored", words, case, replace(case, c=case.c * flip, m=case.m * flip)

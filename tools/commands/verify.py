@@ -238,9 +238,13 @@ def verify_dataset(
         tell=lambda fraction: tell("fitting flanges", 0.9 * fraction),
     )
     data = seen.data or data
+    differences = _differences(calibrations[0], data, standard.designation)
+    other_arm = f"{differences[0]} " if differences and data.header.robot not in ("", calibrations[0].robot) else ""
     if not seen.observations:
         first, reason = seen.refused[0]
-        raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")
+        raise InputError(
+            f"{other_arm}None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}"
+        )
     calibration = min(calibrations, key=lambda one: float(np.median(position_errors(one.X_BC, seen.observations))))
     arm_used, moved, shared = _with_kinematics(Path(result), calibration, data, seen.observations, correction)
     seen = replace(seen, observations=moved)
@@ -253,7 +257,6 @@ def verify_dataset(
     poses = _judge(calibration, data, observations)
     uncorrected: tuple[str, ...] = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
     uncorrected += arm_used
-    differences = _differences(calibration, data, standard.designation)
     gross = _gross(calibration, poses)
     new = [k for k, p in enumerate(poses) if not p.used_before]
     if limit_mm is None:
@@ -265,11 +268,13 @@ def verify_dataset(
         source = "as given with --limit-mm"
     diagnostics = [*differences, *gross, *uncorrected, *_alike(data, observations)]
     verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
+    if other_arm.strip() not in verdict.reason:
+        verdict = replace(verdict, reason=f"{other_arm}{verdict.reason}")
     warnings = (
+        *differences,
         *read_as,
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
-        *differences,
         *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(

@@ -15,7 +15,7 @@ CHECKED = (
     "poses too alike",
     "scanner out of focus or range", "warm-up drift", "slack flange or loose mount", "wrong kinematics file",
     "outlier scans or partial views", "hidden tag", "soft tip worn", "scanner axes mirrored",
-    "scans and poses in different orders", "scanner scale error", "too few scans",
+    "scans and poses in different orders", "scanner scale error", "too few scans", "position columns exchanged",
 )  # fmt: skip
 
 
@@ -149,6 +149,7 @@ def _misread(c: Cause) -> tuple[str, str]:
         "wrong quaternion order": f"Swap the columns, or set 'poses: {{rotation: {order}}}' in dataset.yaml.",
         "poses inverted": "Set 'poses: {frame: base_in_flange}' in dataset.yaml, or invert the poses.",
         "wrong rotation convention": "Set 'poses: {rotation: ...}' in dataset.yaml to what the robot writes.",
+        "position columns exchanged": "Name the columns in the header of the poses in the order of their numbers.",
         "scanner axes mirrored": "Export the clouds in a right-handed frame: x right, y down, z out of the scanner.",
         "scans and poses in different orders": (
             "Pair each scan with its own pose, by the same name; write numbers as 01, 02."
@@ -356,5 +357,5 @@ _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
     "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn,
     "the run was held": _held,
     "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
-    "too few scans": _few, "unexplained": _unexplained,
+    "too few scans": _few, "unexplained": _unexplained, "position columns exchanged": _misread,
 }  # fmt: skip

@@ -139,6 +139,8 @@ def new(
     if form and not dataset:
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
+        if not call.json:
+            typer.echo("The scans are rendered in simulation, which takes about two minutes.")
         written = write_example(folder, call.seed, call.progress, form)
         following, note = f"weldcal calibrate {written}", {}
     else:

@@ -137,9 +137,8 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         )
     if hint := unit_hint(shape):
         typer.echo(hint)
-    typer.echo(
-        f"Pick by number in the scenario, workpiece.seams: [{{edges: [ID, ...]}}]. Picture: {folder / 'report.html'}"
-    )
+    pick = "Pick by number in the scenario, workpiece.seams: [{edges: [ID, ...]}]. " if seams else ""
+    typer.echo(f"{pick}Picture: {folder / 'report.html'}")
 
 
 def _figures(edge: PartEdge) -> tuple[str, str, str]:
