@@ -394,8 +394,10 @@ def _refinement(
 
 
 def _unconfirmed(inliers: list[Observation], seed: int) -> list[str]:
-    """A sentence where the robot's motion alone asks for a correction of the scanner: many programs could not apply it,
-    and without it X_BC would be off by what it takes over."""
+    """Name the scanner correction that the robot's motion alone asks for, in a sentence.
+
+    Many programs could not apply it, and without it X_BC would be off by what it takes over.
+    """
     asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
     if verdict is None or verdict.accepted is None:
         return []
@@ -417,8 +419,9 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
-    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm
-    confirms.
+    """Require one usable scan.
+
+    Where others were refused: four (then more can be taken), or two that the visible arm confirms.
 
     Raises:
         InputError, TooFewPoses: there are fewer.
@@ -440,9 +443,11 @@ def _enough(observations: list[Observation], refused: list[tuple[str, str]], sta
 def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
-    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as
-    axis_turn_deg; None where fewer than four scans show it. From uncorrected scans, as in a calibration from one
-    scan."""
+    """Estimate the rotation of the hole pattern about the flange axis and its spread over the scans (deg).
+
+    It is for later use as axis_turn_deg; None where fewer than four scans show it. From uncorrected scans, as in a
+    calibration from one scan.
+    """
     seen = [o for o in inliers if o.id in patterns and patterns[o.id].turn_known]
     if len(seen) < ENOUGH:
         return None

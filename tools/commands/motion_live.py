@@ -1,5 +1,4 @@
-"""Runs the motion job: calibrates a streaming scanner and its clock live, writes the result, and compares it with the
-truth."""
+"""Run the motion job: calibrate a streaming scanner and its clock live, and compare with the truth."""
 
 import json
 from dataclasses import dataclass
@@ -44,8 +43,7 @@ class MotionOutcome:
         return self.options.out
 
     def true_captures(self) -> dict[int, float]:
-        """True capture times (s) of the frames by number, on the clock of the robot's stream; empty where no simulation
-        knows them.
+        """List true capture times (s) by frame number, on the stream's clock; empty where no simulation knows them.
 
         A drawn arm that follows an emulated controller is behind it: a frame then shows where that arm was before.
         """
@@ -146,8 +144,7 @@ def _ms(values: tuple[float, ...], percentile: float) -> float | None:
 
 
 def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
-    """How long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says, from all joints in
-    motion."""
+    """Estimate how long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says."""
     stream = record.stream("")
     assert stream.joints is not None
     inside = (t > stream.time[0]) & (t < stream.time[-1])
@@ -157,8 +154,10 @@ def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
 
 
 def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:
-    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings. Raises as
-    run_job."""
+    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings.
+
+    Raises as run_job.
+    """
     job = scenario.part(MotionJob)
     if job is not None and job.record:
         job.recording_folder = str(options.out / "recording")

@@ -207,8 +207,9 @@ def verify_dataset(
     limit_mm: float | None = None,
     pose: str | None = None,
 ) -> VerifyReport:
-    """Verify a calibration (its folder or calibration.yaml, or any file with a pose) on a dataset folder; write
-    verification.json and report.html.
+    """Verify a calibration on a dataset folder; write verification.json and report.html.
+
+    The calibration is its folder or calibration.yaml, or any file with a pose.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
     is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
@@ -300,8 +301,7 @@ def verify_dataset(
 
 
 def _calibrations(path: Path, pose: str | None) -> tuple[list[CalibrationResult], tuple[str, ...]]:
-    """What `calibrate` wrote; or the camera's pose in another file in every reading that its numbers allow, and a
-    sentence that names it."""
+    """Read what `calibrate` wrote, or a camera's pose in every reading that its numbers allow, with a sentence."""
     try:
         return [load_result(path)], ()
     except InputError:
@@ -331,8 +331,10 @@ def _with_kinematics(
     observations: tuple[Observation, ...],
     correction: ScannerCorrection | None,
 ) -> tuple[tuple[str, ...], tuple[Observation, ...], tuple[Array, Array] | None]:
-    """The observations with the poses that the arm of the result's kinematics file reaches, and what it states of their
-    errors (see shared_error), or a sentence where the scans have no joint angles."""
+    """Move the observations to the poses that the arm of the result's kinematics file reaches.
+
+    With what it states of their errors (see shared_error), or a sentence where the scans have no joint angles.
+    """
     if not result.kinematics_file:
         return (), observations, None
     q = joint_angles(data, [o.id for o in observations], 6)
@@ -483,8 +485,7 @@ def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...
 
 
 def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
-    """Change of scale that best explains the errors together with a shift, and its standard error; NaN for few
-    scans."""
+    """Estimate the scale that, with a shift, best explains the errors, and its standard error; NaN for few scans."""
     n = len(observations)
     if n < 6:
         return float("nan"), float("nan")

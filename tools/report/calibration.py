@@ -84,8 +84,7 @@ def pose_records(
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive
-    to.
+    """Algorithm 1 on the same data: its figure, its errors at unused poses, and what the figure does not show.
 
     ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at
     the flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
@@ -208,8 +207,7 @@ class CalibrationReport:
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
-        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four
-        errors."""
+        """Interval (mm) of the mean error of as many new scans, with 95 % probability; None for fewer than four."""
         return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     def summary(self) -> dict[str, Any]:
@@ -273,8 +271,10 @@ def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
 def feature_residuals(
     fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]
 ) -> list[dict[str, float | int | str | None]]:
-    """One row per scan: rms residual (mm) of plane, outer edge, bore (None where not seen) and of the hole centres from
-    their pattern (None where fewer than four show), and one sigma (deg) of the rotation about the flange's axis."""
+    """List rms residuals (mm) of plane, outer edge, bore and holes, and the sigma (deg) of the turn, a row a scan.
+
+    The bore is None where not seen, the holes (from their pattern) where fewer than four show.
+    """
     rows: list[dict[str, float | int | str | None]] = []
     for id, fit in fits.items():
         holes = patterns.get(id)
@@ -436,8 +436,7 @@ _SHADES = LinearSegmentedColormap.from_list("known", ["#eef4f8", "#9dc0d8", "#1d
 
 
 def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
-    """Standard deviation (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and from the
-    side."""
+    """Draw the sigma (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and aside."""
     middle, extent = p_B.mean(axis=0), float(np.ptp(p_B, axis=0).max())
     weak, least = weakest_place(estimate, p_B), 1e3 * sigma_at(estimate, middle)
     figure = Figure(figsize=(8.2, 4.0), layout="constrained")

@@ -88,8 +88,7 @@ class DemoResult:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was
-        welded."""
+        """The first screen: of the calibration, by the job's required error; of a weld alone, whether it was welded."""
         scenario, status = self.run.cell.scenario, self.status
         estimate, c = status.estimate, self.run.cell.scenario.calibration
         against = [self.run.reason or "The job was held."] if self.state == "held" else []
@@ -423,8 +422,7 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:
-    """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig.
-    11)."""
+    """Draw the errors of the estimate in use and Algorithm 1's own figure against the scans taken (Fig. 11)."""
     n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
     picture, axes = subplots(7.2, 3.4)
     axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")

@@ -35,8 +35,7 @@ _CENTRES_SAY = 1.5
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """The named causes, the likeliest first; what was examined, its number of scans and the spread that remains (mm,
-    None: unknown)."""
+    """The named causes, the likeliest first; what was examined, number of scans, and the spread left (mm or None)."""
 
     source: str
     causes: tuple[NamedCause, ...]

@@ -1,5 +1,4 @@
-"""The result of `weldcal calibrate` on a recording in motion and its page: residuals against time, cost against the
-offset."""
+"""Write the page of `calibrate` in motion: residuals against time, cost against the clock's offset."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

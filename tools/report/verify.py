@@ -29,8 +29,10 @@ from weldcal.tools.report.render import fixed, known, render
 
 @dataclass(frozen=True)
 class PoseError:
-    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face
-    normals (None where none was seen), and whether the calibration used this scan."""
+    """One scan: distance (mm) of the flange centres by calibration and robot, and angle (deg) of the normals.
+
+    The angle is None where no normal was seen; also whether the calibration used this scan.
+    """
 
     id: str
     error_mm: float
@@ -43,8 +45,10 @@ NONE = "not a verification"
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the
-    calibration states none) and the reason, a sentence."""
+    """The verdict (one of the four above), its limit for the median in mm and the reason, a sentence.
+
+    The limit is None where the calibration states none.
+    """
 
     verdict: str
     limit_mm: float | None

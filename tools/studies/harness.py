@@ -260,8 +260,7 @@ class Measured:
         return [(t.what, t.wanted, f"{t.value:.4g}", t.verdict) for t in self.targets]
 
     def outcome(self) -> Outcome:
-        """The outcome of the command: the JSON object and the table, exit code 1 where a reproduced target is
-        missed."""
+        """Return the JSON object and the table, with exit code 1 where a reproduced target is missed."""
         problem = None if self.figures["state"] != "done" else MISSED if self._fails else ""
         return Outcome(self.figures, text=self.show, problem=problem)
 
@@ -317,8 +316,7 @@ def command_line() -> str:
 
 
 def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Statistics of finite values, NaN for none: by name median, mean, rms, p95, min, max; without names median, mean,
-    p95, max."""
+    """Compute median, mean, rms, p95, min, max by name (median, mean, p95, max without); NaN for no finite value."""
     v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
     of: dict[str, Callable[[Array], Any]] = {
         "median": np.median,

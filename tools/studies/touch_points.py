@@ -88,8 +88,7 @@ _EACH = 20  # worlds of one case
 
 
 def touch_cell(scenario: str, seed: int, points: int, folder: str) -> Mapping[str, object]:
-    """Calibrate a whole simulated cell, let its soft tip touch the part, and judge: the JSON object of `verify
-    --scenario`."""
+    """Calibrate a simulated cell, touch the part with its tip, and judge: as `verify --scenario`."""
     calibrated = run_calibration_live(
         RunOptions(scenario=scenario, out=Path(folder) / f"cell{seed}", seed=seed, browser=False, recording=False)
     )

@@ -224,8 +224,7 @@ def _towards(elevation: float, azimuth: float) -> Array:
 
 
 def _number(axes: Axes3D, shape: PartShape) -> None:
-    """Write the edges' numbers, those of joints and long edges first, each where it covers no other; else not at
-    all."""
+    """Write the edges' numbers, joints and long edges first, each where it covers no other; else not at all."""
     order = {"concave": 0, "flush": 0, "boundary": 1, "convex": 1}
     edges = sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], -e.length_m))
     placed: list[Array] = []

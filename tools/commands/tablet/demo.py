@@ -99,8 +99,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
 
 
 def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCalibration, dict[str, object]]:
-    """Write the run's files, calibrate from them as `weldcal tablet calibrate` does, and compare with the ground
-    truth."""
+    """Write the run's files, calibrate from them as `tablet calibrate` does, and compare with the truth."""
     folder, tablet = options.out, run.cell.job.tablet
     write_visit(run, folder)
     done = calibrate_tablet(
@@ -153,8 +152,7 @@ def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]
 
 
 def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
-    """Depth errors (rms) of the landmarks, apart from the scale: from the tablet's plane, and from each landmark's
-    pixel."""
+    """Compute depth errors (rms) of the landmarks, apart from scale: from the page's plane, and from pixels."""
     job = run.cell.job
     K, truth, depth_m = job.camera.camera_matrix(), job.truth, job.picture(run.root).depth_m
     X_CT = (forward_kinematics(run.cell.station.arm, job.state(run.root).q_look) @ truth.X_FC).inverse() @ truth.X_BT

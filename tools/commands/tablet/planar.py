@@ -108,8 +108,7 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
 
 
 def best_model(visits: Sequence[VisitFits]) -> tuple[str, dict[str, float]]:
-    """The model with the smallest held-out error over all visits, and every model's mean held-out error (mm; NaN:
-    none).
+    """Choose the model of least held-out error over all visits; also every model's mean error (mm; NaN: none).
 
     A free scale is a candidate only if every visit needs it. Only landmarks that every model could hold out are
     compared; with four landmarks there are none, and PnP is chosen.

@@ -150,9 +150,10 @@ def usable_scans(
 
 @dataclass(frozen=True)
 class Draws:
-    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad; NaN where no normals are known) of
-    every draw on the scans that it did not use, how many were refused, and the share of the others that corrected the
-    scanner."""
+    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad) on the unused scans.
+
+    NaN where no normals are known; how many were refused, and the share of the others that corrected the scanner.
+    """
 
     scans: int
     position_m: Array

@@ -1,5 +1,4 @@
-"""Studies on ray-cast frames: flanges found and imagined, half-hidden flanges, and the rotation of filled hole
-patterns."""
+"""Study ray-cast frames: flanges found and imagined, half-hidden ones, and the turn of filled hole patterns."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -157,8 +156,7 @@ def hidden(
 
 
 def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], name: str) -> Mapping[str, object]:
-    """The rotation of the hole pattern in one scan with these openings filled: "none", "open", "right" or "wrong" (over
-    10 degrees)."""
+    """Find the hole pattern's turn with these openings filled: "none", "open", "right" or "wrong" (over 10 deg)."""
     scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
     frame = flange_frame(scanner, _with_filled(standard, filled), np.random.default_rng(list(rng)))
     assert frame.X_CR is not None

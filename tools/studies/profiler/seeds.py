@@ -284,8 +284,7 @@ def predicted_mm(
 
 
 def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[str, Floats]:
-    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has
-    them."""
+    """Predict `points` (), `seam` (3,) mm and `boss` (2,) mm and deg by the bound, where the world has them."""
     data, tests = world.trial.data, world.trial.tests
     assert data.arm is not None
     assert tests is not None

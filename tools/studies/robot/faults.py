@@ -56,8 +56,7 @@ class FaultReport:
     sequences: list[FaultSequence]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are
-        not as required."""
+        """Return the JSON object: ms, and mm of the tool, from the fault on; `wrong` names unmet requirements."""
         stopped = [outcome for outcome in self.outcomes if outcome.did == "stopped"]
         wrong = [{"id": o.name, "reason": "; ".join(o.problems)} for o in self.outcomes if not o.ok]
         wrong += [{"id": f"sequence {s.seed}", "reason": s.verdict} for s in self.sequences if not s.ok]

@@ -42,8 +42,7 @@ FALSE, OF = 3, 54
 
 
 def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
-    """X_BC from centres of a sphere (n >= 4) whose place on the flange is estimated, too; least squares, as commercial
-    software does it.
+    """Estimate X_BC from sphere centres (n >= 4), with the sphere's place on the flange, by least squares.
 
     Gauss-Newton on X_BC c_k - X_BF,k p_FS, from the place as it was meant.
     """
@@ -65,8 +64,7 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
 ) -> tuple[list[dict[str, object]], dict[str, object]]:
-    """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's
-    false segmentations.
+    """Compare sphere and flange in the same scans with 4 and 16 pairs; also Table 1's false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
     """
