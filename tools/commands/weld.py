@@ -12,8 +12,7 @@ from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
-from weldcal.calibration.eye_on_base.stated_error import orientations_of
-from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.models.result_files import whole_result
 from weldcal.systems.cell import Cell
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
