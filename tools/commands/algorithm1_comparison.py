@@ -26,7 +26,8 @@ from weldcal.calibration.published.algorithm1 import (
 )
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-from weldcal.tools.report.calibration import Algorithm1Outcome, error_summary
+from weldcal.tools.report.calibration import Algorithm1Outcome
+from weldcal.tools.report.render import statistics
 
 FEWEST = 6
 """Inliers below which Algorithm 1 is not compared."""
@@ -127,7 +128,7 @@ def compare_algorithm1(
         verification=held.id,
         metric=metric,
         figure_mm=1e3 * run.cost,
-        true_mm=error_summary(1e3 * true),
+        true_mm=statistics(1e3 * true),
         at_verification_mm=1e3 * float(position_errors(run.X_BC, [held])[0]),
         unseen=unseen,
         shares=tuple(float(s) for s in shares.share) if shares is not None else (),

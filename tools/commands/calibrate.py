@@ -53,13 +53,12 @@ from weldcal.tools.report.calibration import (
     Algorithm1Outcome,
     CalibrationReport,
     calibration_report,
-    error_summary,
     pose_records,
     tilt_summary,
 )
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import statistics, write_atomic
 
 _CONFIRMING = 3  # hole circles without which the robot's motion alone does not change the scanner
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
@@ -307,7 +306,7 @@ def calibrate_dataset(
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=error_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
+        held_out_mm=statistics(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=tilt_summary(estimate.held_out.tilt_rad[estimate.inliers]),
         poses=pose_records([o.id for o in observations], estimate.inliers, values, refused),
         icp=icp,
@@ -348,7 +347,7 @@ def calibrate_dataset(
         outliers=outliers,
         algorithm1=algorithm1,
         convergence=curve,
-        k_fold_mm=error_summary(1e3 * folds[np.isfinite(folds)]),
+        k_fold_mm=statistics(1e3 * folds[np.isfinite(folds)]),
         seconds=time.monotonic() - started,
         out=Path(out),
         advice=sampling_advice(estimate, corrected),

@@ -16,10 +16,9 @@ from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_result, motion_screen
-from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.render import render, statistics, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
 
@@ -132,7 +131,7 @@ class MotionOutcome:
                 "clock": c.kind,
                 "clock_offset_ms": None if c.offset_s is None else 1e3 * c.offset_s,
                 "clock_offset_sigma_ms": None if c.sigma_s is None else 1e3 * c.sigma_s,
-                "held_out_mm": error_summary(1e3 * e.held_out_m[e.inliers]),
+                "held_out_mm": statistics(1e3 * e.held_out_m[e.inliers]),
                 "rms_mm": 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2))),
                 "truth": self.truth(),
             }

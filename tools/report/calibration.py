@@ -47,26 +47,12 @@ from weldcal.tools.report.first_screen import (
     work_point_expected,
 )
 from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, subplots, svg
-from weldcal.tools.report.render import fixed, known, render, sigma_rows
-
-
-def error_summary(values: Array) -> dict[str, float]:
-    """Median, mean, 95th percentile and maximum of the finite values (n,), in their unit; NaN where there are none."""
-    v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
-    if len(v) == 0:
-        return dict.fromkeys(("median", "mean", "p95", "max"), float("nan"))
-    return {
-        "median": float(np.median(v)),
-        "mean": float(v.mean()),
-        "p95": float(np.percentile(v, 95)),
-        "max": float(v.max()),
-    }
+from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
 
 
 def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
     """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
-    s = error_summary(np.degrees(tilts_rad))
+    s = statistics(np.degrees(tilts_rad))
     return {k: known(s[k]) for k in ("median", "p95")}
 
 

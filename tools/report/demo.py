@@ -16,7 +16,6 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.tools.report import plots_weld
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import (
     SCANNER,
     ExpectedError,
@@ -34,7 +33,7 @@ from weldcal.tools.report.first_screen import (
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.plots_weld import WeldTrace
-from weldcal.tools.report.render import fixed, render, sigma_rows
+from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
@@ -286,7 +285,7 @@ def seam_document(error: PathError) -> dict[str, float]:
 
 def live_errors(values: np.ndarray) -> dict[str, float]:
     """Median, mean and 95th percentile of the finite values, in their unit; empty where there are none."""
-    found = error_summary(values)
+    found = statistics(values)
     return {name: found[name] for name in ("median", "mean", "p95") if np.isfinite(found[name])}
 
 

@@ -26,12 +26,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from weldcal.calibration.data.results import software_version
-from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
@@ -313,21 +311,6 @@ def command_line() -> str:
         k = words.index("--out")
         words = words[:k] + words[k + 2 :]
     return shlex.join(["weldcal", *(word for word in words if word != "--json")])
-
-
-def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Compute median, mean, rms, p95, min, max by name (median, mean, p95, max without); NaN for no finite value."""
-    v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
-    of: dict[str, Callable[[Array], Any]] = {
-        "median": np.median,
-        "mean": np.mean,
-        "rms": lambda x: np.sqrt(np.mean(x**2)),
-        "p95": lambda x: np.percentile(x, 95),
-        "min": np.min,
-        "max": np.max,
-    }
-    chosen = names or ("median", "mean", "p95", "max")
-    return {name: float(of[name](v)) if len(v) else float("nan") for name in chosen}
 
 
 def done(results: Results) -> list[Result]:

@@ -11,8 +11,9 @@ from weldcal.systems.runner import no_progress
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.touch import run_touches, touching
 from weldcal.tools.commands.weld import run_calibration_live
+from weldcal.tools.report.render import statistics
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.harness import Figures, Results, Row, Study, done, statistics
+from weldcal.tools.studies.harness import Figures, Results, Row, Study, done
 from weldcal.tools.worlds.touch import touch_world
 
 

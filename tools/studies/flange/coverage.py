@@ -22,8 +22,8 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import subplots, svg
-from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics, write_atomic
+from weldcal.tools.studies.harness import Figures, Results, Row, Study
 from weldcal.tools.worlds import wrong_models
 from weldcal.tools.worlds.arm_cells import calibrate_cell
 from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs

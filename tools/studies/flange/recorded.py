@@ -30,8 +30,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Figures, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.studies.harness import Figures, Row, Study
 
 PARTS_OF_A_CLOUD = (2, 4, 8)
 _REACH_M = 0.0015  # about an edge, in which its blur shows

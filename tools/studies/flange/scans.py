@@ -16,8 +16,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
 from weldcal.tools.worlds.flange_frames import WAYS, empty_frame, fit_frame, flange_frame, hidden_frame
 
 WidthOption = Annotated[int, option("--width", "PX", "Width of the PhoXi M images; 2064 is the full width.", min=200)]

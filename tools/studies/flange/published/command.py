@@ -22,6 +22,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.report.render import statistics
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
 from weldcal.tools.studies.flange.published.pairs import (
     KinectOutcome,
@@ -32,7 +33,7 @@ from weldcal.tools.studies.flange.published.pairs import (
 )
 from weldcal.tools.studies.flange.published.report import COST_HEADER, PublishedResults, cost_rows, pictures, tables
 from weldcal.tools.studies.flange.published.simulation import simulate
-from weldcal.tools.studies.harness import Study, statistics
+from weldcal.tools.studies.harness import Study
 from weldcal.tools.worlds.flange_frames import P_FS, SphereScan, cell_scans
 
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}

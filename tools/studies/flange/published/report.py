@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, subplots, svg
-from weldcal.tools.report.render import fixed
+from weldcal.tools.report.render import fixed, statistics
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import COSTS, Errors, Simulation
-from weldcal.tools.studies.harness import Results, Row, Table, statistics
+from weldcal.tools.studies.harness import Results, Row, Table
 
 TABLE1: dict[str, tuple[float, ...]] = {
     "UR5 & PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),
