@@ -36,6 +36,12 @@ def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Ar
     return np.array(out)
 
 
+def _plain(config: SolveConfig) -> Solve:
+    """The plain estimate, without a correction of the scanner, as a Solve."""
+    config = replace(config, leave_one_out=False, hypotheses=150)
+    return lambda observations: (estimate_eye_on_base(observations, config).X_BC, ScannerCorrection())
+
+
 def k_fold(
     observations: Sequence[Observation],
     *,
@@ -53,7 +59,7 @@ def k_fold(
     n = len(observations)
     if not 2 <= folds <= n:
         raise InputError(f"{n} poses cannot be divided into {folds} folds; ask for 2 to {n}.")
-    plain = replace(config or SolveConfig(), leave_one_out=False, hypotheses=150)
+    solve = solve or _plain(config or SolveConfig())
     rng = np.random.default_rng(seed)
     errors = np.full((repeats, n), np.nan)
     for r in range(repeats):
@@ -63,9 +69,7 @@ def k_fold(
             held = set(test.tolist())
             train = [o for i, o in enumerate(observations) if i not in held]
             try:
-                X, correction = (
-                    (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
-                )
+                X, correction = solve(train)
             except InputError:
                 continue
             errors[r, test] = position_errors(X, [corrected_observation(correction, observations[i]) for i in test])
@@ -102,16 +106,12 @@ def convergence(
     n = len(observations)
     counts = np.unique(np.concatenate([np.arange(4, 10), np.round(np.geomspace(9, max(n, 10), 8)).astype(int)]))
     counts = counts[counts <= n - 2]
-    config = SolveConfig(leave_one_out=False, hypotheses=150)
+    solve = solve or _plain(SolveConfig())
     held_out = np.full((orders * n, len(counts)), np.nan)
     for r, shuffled in enumerate(shuffled_orders(observations, orders, seed)):
         for k, m in enumerate(counts):
             try:
-                X, correction = (
-                    (estimate_eye_on_base(shuffled[:m], config).X_BC, ScannerCorrection())
-                    if solve is None
-                    else solve(shuffled[:m])
-                )
+                X, correction = solve(shuffled[:m])
             except InputError:
                 continue  # the first m scans of this order lie in one plane
             seen = correction.points(np.array([o.p_CR for o in shuffled[m:]]))

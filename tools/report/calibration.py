@@ -439,24 +439,12 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
                 p[i], p[j] = a, b
                 sigma[row, column] = 1e3 * sigma_at(estimate, p)
         drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
-        axes.plot(
-            1e3 * p_B[:, i],
-            1e3 * p_B[:, j],
-            "o",
-            color="white",
-            markeredgecolor="#222",
-            markersize=5,
-            label="poses taken",
-        )
-        axes.plot(
-            1e3 * weak[i],
-            1e3 * weak[j],
-            "*",
-            color="#e0872f",
-            markeredgecolor="#222",
-            markersize=15,
-            label="best next pose",
-        )
+        for at, mark, size, colour, label in (
+            (p_B, "o", 5, "white", "poses taken"),
+            (weak[None], "*", 15, "#e0872f", "best next pose"),
+        ):
+            x, y = 1e3 * at[:, i], 1e3 * at[:, j]
+            axes.plot(x, y, mark, color=colour, markeredgecolor="#222", markersize=size, label=label)
         axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")

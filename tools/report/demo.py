@@ -34,7 +34,7 @@ from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
-from weldcal.tools.report.run import RunOptions, robot_timing
+from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
@@ -192,10 +192,7 @@ class DemoResult:
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
-        found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
-        found["robot"] = self.robot
-        if self.run.reason:
-            found["reason"] = self.run.reason
+        found = run_document(self.run, self.options, self.robot)
         if self.warnings:
             found["warnings"] = list(self.warnings)
         if (watched := self.run.cell.job.drift(self.run.root)) is not None:

@@ -23,7 +23,7 @@ from weldcal.tools.commands.tablet.calibrate import TabletCalibration, VisitFile
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.run import RunOptions, run_document
 from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
 
 MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
@@ -63,14 +63,7 @@ class TabletDemo:
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet demo`."""
-        said: dict[str, object] = {
-            "state": "held" if self.run.held else "done",
-            "scenario": self.options.scenario,
-            "seed": self.options.seed,
-            "robot": self.robot,
-        }
-        if self.run.reason:
-            said["reason"] = self.run.reason
+        said = run_document(self.run, self.options, self.robot)
         touches = len(self.run.cell.job.state(self.run.root).touches)
         return {**said, "n_touches": touches, **self.found, **self.run.timing()}
 
