@@ -72,7 +72,8 @@ def applied(result: CalibrationResult, points_C: Array, *, base: bool = False) -
         return corrected
     if result.configuration != ON_BASE:
         raise InputError(
-            "This scanner is on the arm: its points lie in the base by X_BF X_FC, with the flange's pose X_BF at the scan."
+            "This scanner is on the arm: its points lie in the base by X_BF X_FC, with the flange's pose X_BF at the"
+            " scan."
             " Apply without --base, then multiply."
         )
     R, p = result.X_BC.rotation().matrix(), result.X_BC.translation()
