@@ -280,7 +280,7 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
         other = "mm" if unit == "m" else "m"
         raise CloudError(
             f"The points of {name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
-            "units in dataset.yaml."
+            f"units in dataset.yaml to 'clouds: {other}'."
         )
     return points
 
@@ -389,7 +389,7 @@ def check_reach(points: Array, path: Path, unit: str, of: str = "robot's base") 
         other = "mm" if unit == "m" else "m"
         raise DatasetError(
             f"The positions in '{path.name}' lie {reach:.4g} m from the {of}, which is out of reach: they look "
-            f"like {other}; correct units in dataset.yaml."
+            f"like {other}; correct units in dataset.yaml to '{'clouds' if of == 'camera' else 'poses'}: {other}'."
         )
 
 

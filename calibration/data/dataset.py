@@ -440,9 +440,15 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
     spread_C = np.array([p.p_CR for p in pairs])
     a, b = (float(np.median(np.linalg.norm(s - np.median(s, axis=0), axis=1))) for s in (spread_B, spread_C))
     if min(a, b) > 0.0 and not 0.02 < a / b < 50.0:
+        robot_too_large, metres = a > b, (scale_base == 1.0, scale_camera == 1.0)
+        cure = (
+            ("poses: mm" if metres[0] else "clouds: m")
+            if robot_too_large
+            else ("clouds: mm" if metres[1] else "poses: m")
+        )
         raise DatasetError(
             f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
-            "millimetres; correct units in dataset.yaml."
+            f"millimetres; correct units in dataset.yaml to '{cure}'."
         )
     check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
     return tuple(pairs)

@@ -20,6 +20,8 @@ from weldcal.models.errors import InputError
 Which = NDArray[np.bool_] | NDArray[np.int64]
 
 NAME = "observations.csv"
+FEWEST = 5
+"""Scans below which nothing is diagnosed."""
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 _SEEN = (*(f"centre_{a}" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "noise", "coverage")
 _COLUMNS = ("id", *_POSE, *_SEEN)

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.case import FEWEST, DoctorCase
 from weldcal.calibration.doctor.fit import NU, CauseFit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.geometry.robust import f_tail
@@ -24,7 +24,6 @@ UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
 """Millimetres, inches, decimetres and centimetres for metres, and the reverse."""
 _WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's order changes spreads, too
 _REACH_M = (0.02, 9.0)
-FEWEST = 5
 WORN = 0.25  # of a soft tip's gain: four times the spread of a good one (servo settings, gain_sigma)
 LOOKS_WRONG_M, LOOKS_WRONG_RAD = 3e-3, 0.03  # residuals of no arm and scanner that work
 _Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
@@ -87,6 +86,11 @@ def _misreadings(case: DoctorCase) -> Iterator[tuple[str, str, DoctorCase, Docto
         yield cause, words, case, case.with_poses(pose(R, case.X_BF[:, :3, 3]))
     words = "the poses are the base in the flange, the inverse of what is expected"
     yield "poses inverted", words, case, case.with_poses(inverse(case.X_BF))
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        swapped = case.X_BF.copy()
+        swapped[:, [first, second], 3] = swapped[:, [second, first], 3]
+        words = f"the columns {'xyz'[first]} and {'xyz'[second]} of the poses are exchanged"
+        yield "position columns exchanged", words, case, case.with_poses(swapped)
     flip = np.array([-1.0, 1.0, 1.0])  # one mirror stands for all: the others are turned ones
     words = "the scanner's frame is left-handed: one of its axes is mirrored"
     yield "scanner axes mirrored", words, case, replace(case, c=case.c * flip, m=case.m * flip)

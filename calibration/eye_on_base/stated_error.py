@@ -88,6 +88,23 @@ def joint_terms(
     return joint, correction
 
 
+def observed_document(
+    observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
+) -> dict[str, Any]:
+    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
+    joints where known."""
+    X = X_FR or RigidTransform()
+    return {
+        "feature_xyz": [float(v) for v in X.translation()],
+        "feature_wxyz": [float(v) for v in X.rotation().ToQuaternion().wxyz()],
+        "xyz": [[float(v) for v in o.p_BR] for o in observations],
+        "wxyz": [[float(v) for v in o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations],
+        "camera": [[float(v) for v in o.p_CR] for o in observations],
+        "normals": [None if o.n_C is None else [float(v) for v in o.n_C] for o in observations],
+        "joints": [[float(v) for v in q] for q in joints],
+    }
+
+
 def orientations_of(observations: Sequence[Observation], X_FR: RigidTransform | None = None) -> dict[str, Any]:
     """Summarise the feature's orientations in the base for CalibrationResult.orientations.
 

@@ -28,25 +28,6 @@ LEAST_OTHER = 0.05  # a choice: scanner and fit always add some noise; without i
 _USUAL_POSTURE = np.radians([-90.0, 110.0, -110.0, -90.0, 0.0])  # of the second joint and the others, over a table
 
 
-def observed_document(
-    observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
-) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed.
-
-    Feature in the base, seen centre and normal, joints where known.
-    """
-    X = X_FR or RigidTransform()
-    return {
-        "feature_xyz": [float(v) for v in X.translation()],
-        "feature_wxyz": [float(v) for v in X.rotation().ToQuaternion().wxyz()],
-        "xyz": [[float(v) for v in o.p_BR] for o in observations],
-        "wxyz": [[float(v) for v in o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations],
-        "camera": [[float(v) for v in o.p_CR] for o in observations],
-        "normals": [None if o.n_C is None else [float(v) for v in o.n_C] for o in observations],
-        "joints": [[float(v) for v in q] for q in joints],
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class ArmEffect:
     """``effect`` (n, 3, k) m: change of scanned minus touched by each error of the arm of one standard deviation.

@@ -15,6 +15,12 @@ from weldcal.tools.report.render import fixed
 KeepPage = Callable[[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]], None]
 
 
+def run_document(run: Run[Any], options: "RunOptions", robot: str) -> dict[str, object]:
+    """Return what the JSON object of every run begins with."""
+    found = {"state": "held" if run.held else "done", "scenario": options.scenario, "seed": options.seed}
+    return {**found, "robot": robot, **({"reason": run.reason} if run.reason else {})}
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """The user's options of a run.

@@ -1,5 +1,4 @@
-"""The result of `weldcal verify RESULT PAIRS` and its page: the rule of the verdict, residuals and held-out errors of
-every pair."""
+"""Write the page of `verify` on pairs: the rule of the verdict, residuals and held-out errors of every pair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

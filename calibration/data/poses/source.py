@@ -293,7 +293,7 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
     if found.unit and unit not in ("auto", found.unit):
         raise DatasetError(
             f"'{found.source}' is in {found.unit} ({found.read_as}), and dataset.yaml says poses: {unit}; correct units"
-            " in dataset.yaml."
+            f" in dataset.yaml to 'poses: {found.unit}'."
         )
     if form.frame not in _FRAMES:
         raise DatasetError(f"dataset.yaml names the frame '{form.frame[:40]}'; write {' or '.join(_FRAMES)}.")

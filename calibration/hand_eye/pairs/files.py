@@ -21,7 +21,7 @@ from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
-from weldcal.calibration.hand_eye.pairs.importing import StatedForms, import_pairs
+from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, NEAREST_M, StatedForms, import_pairs
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -160,6 +160,8 @@ def _pairs(
     for who, one in more.items():
         X = one.readings[0].X.copy()
         X[:, :3, 3] *= found_pairs.metres
+        if who == "robot2":
+            _require_reach(X, found_pairs.reading["robot"]["unit"], path.name)
         if len(X) != found_pairs.counts[0] and (who != "link" or len(X) != 1):
             raise DatasetError(f"'{path.name}' holds {found_pairs.counts[0]} robot poses and {len(X)} {who} poses.")
         others[who] = X if len(X) == 1 and who == "link" else X[rows_r]
@@ -252,6 +254,16 @@ def _pictures(folder: Path, n: int) -> str:
         f"'{folder.name}' holds {n} pictures and no camera poses: name the board in them, for example --board"
         " chessboard:9x6:25 (inner corners and the side of a square in mm)."
     )
+
+
+def _require_reach(X: Array, unit: object, source: str) -> None:
+    """Raise DatasetError where the second robot's poses (n, 4, 4), in the first one's unit, are out of any reach."""
+    far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
+    if not NEAREST_M < far < FARTHEST_M:
+        raise DatasetError(
+            f"The second robot's positions of '{source}' have a median of {far:.3g} m from its base, in {unit} as the"
+            " first robot's: write the positions of both robots in one unit."
+        )
 
 
 def _no_lists(folder: Path) -> str:

@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors, run_algorithm1
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     FAILED,
@@ -24,6 +24,7 @@ from weldcal.calibration.published.algorithm1 import (
     translation_cost,
 )
 from weldcal.models.errors import InputError
+from weldcal.tools.commands.algorithm1_comparison import algorithm1_curve, run_algorithm1
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -132,9 +133,12 @@ def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None
     assert a.shape == (2, 15)
     assert np.isfinite(a).all()
     assert (a == b).all()
-    c, d = (convergence(observations[:-1], CentreVerification(observations[-1]), orders=2, seed=1) for _ in range(2))
+    *scans, held = observations
+    c, d = (convergence(scans, orders=2, seed=1) for _ in range(2))
     assert np.array_equal(c.held_out, d.held_out, equal_nan=True)
-    assert np.array_equal(c.figure_true, d.figure_true, equal_nan=True)
+    e, f = (algorithm1_curve(scans, CentreVerification(held), c.counts, orders=2, seed=1) for _ in range(2))
+    assert e[1].shape == c.held_out.shape
+    assert np.array_equal(e[1], f[1], equal_nan=True)
     with pytest.raises(InputError, match="cannot be divided into 20 folds"):
         k_fold(observations, folds=20)
 

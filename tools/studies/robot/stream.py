@@ -285,8 +285,7 @@ class JobsReport:
         return Lateness([int(count) for count in counts], max(job.lateness.worst_ms for job in self.jobs))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object; `over_8_ms` counts velocities, `limits_ms` are those of the bins of `velocities` and of the
-        host's wake-ups."""
+        """Return the JSON object; `over_8_ms` counts velocities, `limits_ms` bound the bins."""
         late = self.lateness
         return {
             "state": "done",
