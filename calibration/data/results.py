@@ -209,7 +209,7 @@ def load_correction(path: Path) -> ScannerCorrection | None:
     if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
     document = read_document(path)
-    if not isinstance(document, dict) or not {"X_BC", "X_FC", "X_LC"} & set(document):
+    if not isinstance(document, dict) or not {"X_BC", "X_FC", "scanner_correction"} & set(document):
         raise InputError(f"'{path}' is not a calibration result; give a folder written by 'weldcal calibrate'.")
     return correction_from_document(document.get("scanner_correction"), path.name)
 
@@ -368,10 +368,8 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 
 def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
     """Where a user of the pose finds the scanner correction: the command and the Python call that apply it."""
-    return (
-        f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them, in Python"
-        f" weldcal.read_calibration({str(file)!r}).correct(points)."
-    )
+    call = f", in Python weldcal.read_calibration({str(file)!r}).correct(points)" if symbol == "X_BC" else ""
+    return f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them{call}."
 
 
 def correction_note(result: CalibrationResult, file: Path | str | None = None) -> str | None:
