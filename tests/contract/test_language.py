@@ -13,7 +13,8 @@ import pytest
 from tests.places import ROOT
 
 LONGEST = 30  # words a sentence; writers aim at 25
-WRITTEN_BY_COMMANDS = ("scenario.md", "command_line.md", "BENCHMARK.md")  # their words come from the source
+# Their words come from the source.
+WRITTEN_BY_COMMANDS = ("scenario.md", "command_line.md", "BENCHMARK.md", "weld_log_columns.md")
 PAGES = [
     ROOT / "README.md",
     *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in WRITTEN_BY_COMMANDS),
@@ -79,7 +80,8 @@ def passages(markdown: str) -> Iterator[str]:
 def faults(text: str) -> list[str]:
     """Name the sentences of a text that are too long, and its forbidden words."""
     long = [f"{length(part)} words: {part}" for part in sentences(text) if length(part) > LONGEST]
-    return long + [f"'{word}' in: {text[:90]}" for word in FORBIDDEN.findall(text)]
+    words = FORBIDDEN.findall(re.sub(r'"[^"]*"', "", text))  # a page may quote a message of the program
+    return long + [f"'{word}' in: {text[:90]}" for word in words]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
