@@ -12,7 +12,7 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_document
-from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import DocumentSection, read_document, shown
@@ -195,6 +195,22 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
 def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
     """A fixed target's centre (m) and normal in the base as plain values."""
     return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
+
+
+def load_correction(path: Path) -> ScannerCorrection | None:
+    """Read the scanner correction of any calibration.yaml (or the folder that holds it); None where it has none.
+
+    Raises InputError: the file is missing or no calibration, or its correction cannot be read.
+    """
+    path = Path(path)
+    path = path / RESULT_FILE if path.is_dir() else path
+    require_whole(path)
+    if not path.exists():
+        raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
+    document = read_document(path)
+    if not isinstance(document, dict) or not {"X_BC", "X_FC", "X_LC"} & set(document):
+        raise InputError(f"'{path}' is not a calibration result; give a folder written by 'weldcal calibrate'.")
+    return correction_from_document(document.get("scanner_correction"), path.name)
 
 
 def load_result(path: Path) -> CalibrationResult:

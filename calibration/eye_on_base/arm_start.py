@@ -18,9 +18,9 @@ from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.models.arms.chain import Chain, chain_capsules, chain_frames, known_chains, load_chain
+from weldcal.models.arms.chain import Chain, chain_capsules, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
 from weldcal.models.arms.urdf import link_capsules
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -204,7 +204,7 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
         return {}
     if q is None:
         return {}
-    reached = [(chain_frames(arm, one)[-1] @ arm.X_LF)[:3, 3] for one in q]
+    reached = [(joint_frames(arm.stack, one)[-1] @ arm.X_LF)[:3, 3] for one in q]
     off = max(float(np.linalg.norm(p - data.poses[id].translation())) for p, id in zip(reached, ids, strict=True))
     return dict(zip(ids, q, strict=True)) if off < _JOINTS_M else {}
 
@@ -226,7 +226,7 @@ def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
     """The capsules of an arm at joint angles (n,) rad."""
-    frames = [np.eye(4), *chain_frames(arm, q)]
+    frames = [np.eye(4), *joint_frames(arm.stack, q)]
     if arm.name in known_arms():
         rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(load_arm(arm.name))]
     else:

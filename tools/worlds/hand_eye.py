@@ -38,9 +38,11 @@ _LEAST = 6  # corners in an image that is kept
 
 @dataclass(frozen=True)
 class PairedPoses:
-    """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as
-    estimated, ``X`` (4, 4) and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this
-    ``kind``."""
+    """Pairs of one cell.
+
+    ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4) and
+    ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``.
+    """
 
     kind: str
     F: Array
@@ -185,9 +187,11 @@ class MistakenPairs:
 
 @dataclass(frozen=True)
 class SolverVerdict:
-    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the
-    mistake), or "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the
-    truth."""
+    """What the solver said of a world.
+
+    "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or "NAN" and "WRONG", which must
+    not be; ``nees``: of the answer, in units of the region that holds the truth.
+    """
 
     said: str
     sentence: str
@@ -195,8 +199,11 @@ class SolverVerdict:
 
 
 def random_world(rng: np.random.Generator, mistake: str | None = None) -> MistakenPairs:
-    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a
-    corner), outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
+    """Draw a world with any motion, mounting, noise and outliers, and one of the usual mistakes.
+
+    The noise is normal or heavy-tailed, about the middle of a board whose origin is a corner. ``mistake``: the mistake;
+    else half of them are without.
+    """
     motion = str(rng.choice(MOTIONS))
     if mistake is None:
         mistake = "none" if rng.uniform() < 0.5 else str(rng.choice(MISTAKES[1:]))
@@ -334,8 +341,10 @@ class WrittenSet:
 
 
 def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
-    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each; one list may be changed as
-    a whole."""
+    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each.
+
+    One list may be changed as a whole.
+    """
     n = int(rng.integers(6, 41)) if n is None else n
     noise = np.radians(ROTATION_DEG) * rng.uniform(), 1e-3 * POSITION_MM * rng.uniform()
     turned = Rotation.from_rotvec(rng.normal(size=(n, 3)) * float(rng.choice(_SPREADS)) / 2.0) * Rotation.random(
