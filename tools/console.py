@@ -53,19 +53,25 @@ NARROW, WIDE = 40, 130
 """Widths of the terminal, in characters, within which text is wrapped; beyond it lines become hard to read."""
 
 
-def emit_summary(title: str, rows: Mapping[str, str]) -> None:
+def emit_summary(title: str, rows: Mapping[str, str], most: int | None = None) -> bool:
     """Writes a heading and a two-column list on stdout, wrapped between words; rows with empty text are omitted.
 
-    Lines of a text stay lines. A name that is too long for its column stands on a line of its own.
+    Lines of a text stay lines. A name that is too long for its column is on a line of its own.
+
+    Returns:
+        False where it has more than ``most`` lines: then nothing is written.
     """
     known = [name.rstrip() for name, text in rows.items() if text]
     column = min(max(map(len, known), default=0), MOST_NAME)
     wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    lines = [line for name, text in rows.items() if text for line in summary_lines(name.rstrip(), text, column, wide)]
+    if most is not None and len(lines) + bool(title) > most:
+        return False
     if title:
         typer.secho(title, bold=True)
-    for name, text in rows.items():
-        if text:
-            typer.echo("\n".join(summary_lines(name.rstrip(), text, column, wide)))
+    for line in lines:
+        typer.echo(line)
+    return True
 
 
 MOST_NAME = 26

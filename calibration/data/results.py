@@ -357,10 +357,10 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 
 
 def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
-    """Where a user of the pose finds the scanner correction: the file, and the Python call that applies it."""
+    """Where a user of the pose finds the scanner correction: the command and the Python call that apply it."""
     return (
-        f"{symbol} applies to corrected scanner points. The correction is in {file}, scanner_correction; in Python: "
-        f"weldcal.read_calibration({str(file)!r}).correct(points)."
+        f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them, in Python"
+        f" weldcal.read_calibration({str(file)!r}).correct(points)."
     )
 
 

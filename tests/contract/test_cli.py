@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.cli.app import app
+from weldcal.tools.cli.app import PANELS, app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
@@ -61,6 +62,9 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
     if name == "weldcal new":  # its argument is its output folder
         assert "--seed" in options
         return
+    if name == "weldcal export":  # its options name the files; nothing random
+        assert {"--ros2", "--drake-directives"} <= options
+        return
     # these only look: they write nothing and leave nothing to chance
     only_look = (
         "weldcal view",
@@ -71,8 +75,29 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
         "weldcal robots",
         "weldcal schema",
         "weldcal mutate",
+        "weldcal dev mutate",
+        "weldcal apply",  # its argument is the file that it writes
     )
     assert name in only_look or {"--out", "--seed"} <= options
+
+
+def test_every_command_is_on_one_panel_of_the_help() -> None:
+    shown = [name for name, found in typer.main.get_command(app).commands.items() if not found.hidden]  # type: ignore[attr-defined]
+    listed = [name for names in PANELS.values() for name in names]
+    assert sorted(shown) == sorted(listed)
+    assert len(set(listed)) == len(listed)
+
+
+def test_a_shell_completes_names_without_a_heavy_import() -> None:
+    script = (
+        "import sys\nfrom weldcal.tools.cli import app as cli\nsys.argv = ['weldcal']\n"
+        "try:\n    cli.main()\nexcept SystemExit:\n    pass\n"
+        f"assert not {{*{HEAVY}}} & {{*sys.modules}}"
+    )
+    environment = os.environ | {"_WELDCAL_COMPLETE": "complete_bash", "COMP_WORDS": "weldcal c", "COMP_CWORD": "1"}
+    done = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["calibrate", "check-robot", "check-cell"]
 
 
 def test_help_loads_no_heavy_library() -> None:

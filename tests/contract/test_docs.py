@@ -66,7 +66,8 @@ def leaves(command: Any, name: str = "") -> Iterator[str]:
     hidden."""
     if hasattr(command, "commands"):
         for word, child in command.commands.items():
-            yield from leaves(child, f"{name} {word}".strip())
+            if not getattr(child, "hidden", False):
+                yield from leaves(child, f"{name} {word}".strip())
     elif not command.hidden:
         yield name
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -96,19 +97,32 @@ def test_each_folder_with_python_files_is_a_package() -> None:
 def test_the_wheel_holds_every_file_and_nothing_at_the_top(built: Built) -> None:
     with zipfile.ZipFile(built.wheel) as wheel:
         names = {name for name in wheel.namelist() if not name.endswith("/")}
-    assert {name.split("/")[0] for name in names} == {"weldcal", "weldcal-0.2.0.dist-info"}
+    assert {name.split("/")[0] for name in names} == {"weldcal", "weldcal-1.0.0.dist-info"}
     packaged = {name.removeprefix("weldcal/") for name in names if name.startswith("weldcal/")}
     assert packaged == source_files()
 
 
 def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
     with zipfile.ZipFile(built.wheel) as wheel:
-        commands = wheel.read("weldcal-0.2.0.dist-info/entry_points.txt").decode()
-        metadata = wheel.read("weldcal-0.2.0.dist-info/METADATA").decode()
+        commands = wheel.read("weldcal-1.0.0.dist-info/entry_points.txt").decode()
+        metadata = wheel.read("weldcal-1.0.0.dist-info/METADATA").decode()
         licences = {name.rsplit("/", 1)[-1] for name in wheel.namelist() if "/licenses/" in name}
     assert "weldcal = weldcal.tools.__main__:main" in commands
     assert "License-Expression: BSD-3-Clause" in metadata
     assert licences == {"LICENSE", "NOTICE"}
+
+
+def test_an_index_would_accept_wheel_and_sdist(built: Built) -> None:
+    command = [sys.executable, "-P", "-m", "twine", "check", "--strict", str(built.wheel), str(built.sdist)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    assert checked.stdout.count("PASSED") == 2
+
+
+def test_the_size_of_the_wheel_is_the_one_that_is_stated(built: Built) -> None:
+    page = (ROOT / "docs" / "first_hour" / "install_and_demo.md").read_text()
+    (stated,) = re.findall(r"wheel of weldcal has ([\d.]+) MB", page)
+    assert abs(built.wheel.stat().st_size / 1e6 - float(stated)) < 0.15
 
 
 def test_the_sdist_holds_what_a_build_needs(built: Built) -> None:

@@ -1,7 +1,9 @@
 """The command line: every command that is found, in its group, in the order of the help text."""
 
 from collections.abc import Iterable, Iterator, MutableMapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
 import typer
@@ -21,30 +23,32 @@ GROUPS = {
     "tablet": "Calibrate a wrist camera with a tablet as target.",
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",
+    "dev": "Measure weldcal itself: benchmarks, published studies, mutations.",
 }
 """The groups of commands with their help text; a group that is not here needs no text."""
 DEFAULTS = {"hand-eye": "ax-yb"}
 """The command of a group that is meant where a file follows the group's name."""
+DEVELOPERS = ("benchmark", "reproduce", "mutate")
+"""What is listed under `weldcal dev` only; the names without `dev` work too."""
 
-ORDER = (
-    *(
-        "demo",
-        "calibrate",
-        "verify",
-        "doctor",
-        "fleet",
-        "monitor",
-        "plan-motion",
-        "plan-poses",
-        "weld",
-        "view",
-        "replay",
+PANELS = {
+    "Calibrate": (
+        *("calibrate", "verify", "apply", "hand-eye", "profiler", "tablet", "plan-poses", "plan-motion"),
+        *("doctor", "monitor", "fleet"),
     ),
-    *("robots", "emulate-ur", "emulate-cell", "check-robot", "new", "schema", "part", "check-cell", "print-board"),
+    "Weld": ("demo", "weld", "part", "new", "finger", "tool"),
+    "Robot": ("robots", "check-robot", "check-cell", "emulate-ur", "emulate-cell"),
+    "Data": ("import", "export", "schema", "print-board"),
+    "Look": ("view", "replay"),
+    "Develop": ("dev",),
+}
+"""The commands and groups in the order of the help text."""
+ORDER = (
+    *(name for names in PANELS.values() for name in names),
     *("tablet serve", "tablet calibrate", "tablet demo"),
     *("profiler edge", "profiler sphere", "profiler compensate", "profiler seam", "profiler clock", "profiler live"),
 )
-"""The commands that the help text lists first; the others follow by name."""
+"""The full names of the commands in the order of the help text; the others follow by name."""
 
 
 class LazyCommands(MutableMapping[str, Any]):
@@ -53,6 +57,10 @@ class LazyCommands(MutableMapping[str, Any]):
     def __init__(self, entries: Iterable[Entry], groups: MutableMapping[str, Any]) -> None:
         self.entries = {entry.title.split(" ")[-1]: entry for entry in entries}
         self._made: dict[str, Any] = dict.fromkeys(self.entries) | dict(groups)
+
+    def is_made(self, name: str) -> bool:
+        """Whether the command needs no import, or does not exist."""
+        return self._made.get(name) is not None or name not in self.entries
 
     def __getitem__(self, name: str) -> Any:
         if self._made[name] is None:
@@ -101,16 +109,32 @@ class CommandGroup(TyperGroup):
                 self.commands[args[0]]
         return super().resolve_command(ctx, args)
 
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names, without an import."""
+        return list(self.commands)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command; while a shell completes its name, only its line of help, without an import."""
+        commands: LazyCommands = self.commands  # type: ignore[assignment]
+        if ctx.resilient_parsing and not commands.is_made(cmd_name):
+            entry = commands.entries[cmd_name]
+            return SimpleNamespace(hidden=entry.hidden, get_short_help_str=lambda *_: entry.short_help)
+        return super().get_command(ctx, cmd_name)
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Writes the list of commands, each with its whole short help."""
+        """Writes the list of commands by panel, each with its whole short help."""
         entries = self.commands.entries  # type: ignore[attr-defined]
-        rows = [
-            (name, entries[name].short_help if name in entries else self.commands[name].help)
+        shown = {
+            name: entries[name].short_help if name in entries else self.commands[name].help
             for name in self.commands
-            if name not in entries or not entries[name].hidden
-        ]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
+            if not (entries[name].hidden if name in entries else self.commands[name].hidden)
+        }
+        panels = dict(PANELS) if ctx.parent is None else {}
+        panels["Commands"] = tuple(n for n in shown if not any(n in names for names in panels.values()))
+        for title, names in panels.items():
+            if rows := [(name, shown[name]) for name in names if name in shown]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
 
 def main() -> None:
@@ -151,15 +175,20 @@ def build_app() -> typer.Typer:
         name="weldcal",
         cls=group_class(""),
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     root.callback(help=PURPOSE)(weldcal)
+    developers = tuple(replace(entry, hidden=False) for entry in parts[""] if entry.title in DEVELOPERS)
+    dev_group = type("CommandGroup", (CommandGroup,), {"entries": developers})
+    dev = typer.Typer(cls=dev_group, help=GROUPS["dev"], no_args_is_help=True)
     for name in filter(None, parts):
         group = typer.Typer(cls=group_class(name), help=GROUPS.get(name, ""), no_args_is_help=True)
-        root.add_typer(group, name=name)
+        if name in DEVELOPERS:
+            dev.add_typer(group, name=name)
+        root.add_typer(group, name=name, hidden=name in DEVELOPERS)
+    root.add_typer(dev, name="dev")
     return root
 
 

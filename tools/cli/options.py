@@ -93,6 +93,10 @@ COMMON: dict[str, tuple[Any, object]] = {
     ),
     "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
     "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),
+    "verbose": (
+        Annotated[bool, typer.Option("--verbose", "-v", help="Print every figure, not only the verdict.")],
+        False,
+    ),
     "debug": (Annotated[bool, switch("--debug", "Show the traceback of an internal error.")], False),
 }
 """Every common option with its default, by the name of its parameter."""
@@ -100,7 +104,7 @@ COMMON: dict[str, tuple[Any, object]] = {
 MOTION = ("dry_run", "pace", "speed_factor")
 LIVE = ("browser", "share", "realtime", "robot", *MOTION)
 FARM = ("workers", "scheduler")
-RESULT = ("out", "overwrite", "seed", "json", "debug")
+RESULT = ("out", "overwrite", "seed", "json", "verbose", "debug")
 LOOK = ("json", "debug")
 """Groups of common options: of arm motion, of a live run, of a study of many tasks, of a command that writes a result,
 of one that only reads."""
@@ -134,6 +138,7 @@ class Call:
         self.out: Path | None = given.get("out")
         self.seed: int = given.get("seed", 0)
         self.json: bool = given.get("json", False)
+        self.verbose: bool = given.get("verbose", False)
         self.given = given
         self.written: Path | None = None
         self._kept: list[Path] = []
@@ -307,8 +312,29 @@ def check_writable(folder: Path) -> None:
         ) from problem
 
 
-def _emit_first(first: "FirstScreen", written: Path | None) -> None:
-    """Prints the same as the first screen of the report, and the report's path."""
+MOST_LINES = 12
+"""Lines of a result in the terminal: verdict, figure, pose, what could be wrong, next step, files."""
+
+
+def _emit_first(title: str, first: "FirstScreen", written: Path | None) -> None:
+    """Prints the verdict and what follows from it, with as many of the concerns and notes as fit."""
+    files = "" if written is None else f"{written / 'report.html'} (-v prints every figure here)"
+    of_concerns, of_notes = len(first.concerns), len(first.notes)
+    sizes = [(c, n) for c in range(of_concerns, min(of_concerns, 1) - 1, -1) for n in range(of_notes, -1, -1)]
+    for concerns, notes in sorted(sizes, key=lambda size: (-min(size), -sum(size))):
+        rows = first.brief(concerns, notes) | {"report": files}
+        last = (concerns, notes) == (min(of_concerns, 1), 0)
+        if console.emit_summary(f"{title}: {first.verdict}", rows, most=None if last else MOST_LINES):
+            return
+
+
+def _emit_all(title: str, outcome: Outcome, first: "FirstScreen", written: Path | None) -> None:
+    """Prints every row, then the same as the first screen of the report, and the report's path."""
+    values = dict(outcome.summary if outcome.values is None else outcome.values)
+    values.pop("unobservable", None)  # what matters to the pose is among the first screen's concerns
+    if isinstance(warnings := values.get("warnings"), list):
+        values["warnings"] = [text for text in warnings if text not in (*first.concerns, *first.notes)]
+    console.emit_summary(title, console.rows(values) | dict(outcome.rows))
     rows = first.rows()
     if written is not None:
         rows |= {"written to": str(written), "report": str(written / "report.html")}
@@ -325,26 +351,22 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     call.show_result(outcome.first)
     summary = outcome.summary
     state = str(summary.get("state", "done"))
+    first = outcome.first
     if call.json:
-        first = outcome.first
         console.emit_json(summary if first is None else {"first_screen": first.document(), **summary})
-    elif callable(outcome.text):
-        outcome.text()
     elif outcome.text is not None:
-        console.emit_text(outcome.text)
-    else:
-        values = dict(summary if outcome.values is None else outcome.values)
-        if outcome.first is not None:
-            values.pop("unobservable", None)  # what matters to the pose is among the first screen's concerns
-        if outcome.first is not None and isinstance(warnings := values.get("warnings"), list):
-            said_there = (*outcome.first.concerns, *outcome.first.notes)
-            values["warnings"] = [text for text in warnings if text not in said_there]
-        rows = console.rows(values) | dict(outcome.rows)
-        if outcome.first is None:
-            rows |= {} if call.written is None else {"written to": str(call.written)}
+        if callable(outcome.text):
+            outcome.text()
+        else:
+            console.emit_text(outcome.text)
+    elif first is not None and call.verbose:
+        _emit_all(f"{title}: {state}", outcome, first, call.written)
+    elif first is None:
+        rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
+        rows |= {} if call.written is None else {"written to": str(call.written)}
         console.emit_summary(f"{title}: {state}", rows)
-    if outcome.first is not None and not call.json:
-        _emit_first(outcome.first, call.written)
+    if first is not None and not call.json and not call.verbose:
+        _emit_first(title, first, call.written)
     problem = outcome.problem
     if problem is None and state != "done":
         problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")

@@ -354,6 +354,7 @@ def calibrate_dataset(
         out=Path(out),
         advice=sampling_advice(estimate, corrected),
         patterns=seen.patterns,
+        clouds=seen.clouds,
         notes=data.notes,
         refinement=None if refined is None else refined.document(refine or ""),
         limit_mm=limit_mm,

@@ -46,7 +46,17 @@ from weldcal.tools.report.first_screen import (
     work_point_error,
     work_point_expected,
 )
-from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, subplots, svg
+from weldcal.tools.report.pictures import (
+    MOST_SCANS,
+    OURS,
+    THEIRS,
+    TRUTH,
+    error_bars,
+    error_field,
+    scan_pictures,
+    subplots,
+    svg,
+)
 from weldcal.tools.report.render import fixed, known, render, sigma_rows
 
 
@@ -115,7 +125,7 @@ class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder.
 
     ``observations`` include the scanner correction where one was accepted; ``notes`` say in which form the dataset was
-    read; ``limit_mm`` is the error that the job allows (None: not stated).
+    read; ``clouds`` are each scan's points (N, 3) m of C about its flange; ``limit_mm`` is the error that the job allows (None: not stated).
     """
 
     result: CalibrationResult
@@ -132,6 +142,7 @@ class CalibrationReport:
     out: Path
     advice: tuple[str, ...] = ()
     patterns: dict[str, HolePattern] = field(default_factory=dict)
+    clouds: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     refinement: dict[str, Any] | None = None
     limit_mm: float | None = None
@@ -332,6 +343,8 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         pose_rows=_pose_table(report),
         feature_rows=feature_table(report.fits, report.patterns),
         feature_header=HEADER,
+        scans=scan_pictures(report.clouds, report.fits) if report.fits and report.clouds else None,
+        n_scans=min(len(report.fits), MOST_SCANS),
         refused=report.refused,
         first=report.first,
         pose_facts=[

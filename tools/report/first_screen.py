@@ -4,6 +4,7 @@ poses.
 It holds the rule of the verdict, every printed form of a pose, and the error of a scanned point at the work point.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -169,6 +170,12 @@ class ShownPose:
         rows = self.rows()
         return (("position", rows["position"]), ("roll pitch yaw", rows["roll pitch yaw"]))
 
+    @property
+    def line(self) -> str:
+        """Position and rotation vector on one line."""
+        p, r = 1e3 * self.X.translation(), rotation_vector(self.X.rotation())
+        return f"{p[0]:.3f}, {p[1]:.3f}, {p[2]:.3f} mm; rotation vector {r[0]:.6f}, {r[1]:.6f}, {r[2]:.6f} rad"
+
     def rows(self) -> dict[str, str]:
         """The rows for the terminal."""
         return pose_rows(self.X, self.symbol, self.words)
@@ -285,6 +292,21 @@ class FirstScreen:
             rows |= {name + " " * k: text for name, text in pose.rows().items()}
         return rows
 
+    def brief(self, concerns: int, notes: int) -> dict[str, str]:
+        """The rows for a terminal that shows the result on a few lines, with so many of the concerns and notes."""
+
+        def listed(texts: Sequence[str], number: int) -> str:
+            shown = [f"- {first_sentence(text)}" for text in texts[:number]]
+            left = len(texts) - number
+            return "\n".join(shown + ([f"- {left} more in the report"] if left > 0 else []))
+
+        rows = {"why": self.reason, "result": f"{self.expected.what}: {self.expected.figure}"}
+        rows |= {pose.symbol: pose.line for pose in self.poses}
+        rows |= {name: first_sentence(text) for name, text in self.more.items()}
+        rows |= {"could be wrong": listed(self.concerns, concerns) or self.nothing}
+        rows |= {"good to know": listed(self.notes, notes)}
+        return rows | {"next": self.next.command or first_sentence(self.next.text)}
+
     def document(self) -> dict[str, object]:
         """The JSON object."""
         tolerance = self.found.tolerance
@@ -384,6 +406,11 @@ def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
         return tuple(every)
     kept = every[: MOST_CONCERNS - 1]
     return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
+
+
+def first_sentence(text: str) -> str:
+    """The text up to the end of its first sentence."""
+    return re.split(r"(?<=[.!?])\s+(?=[A-Z])", text.strip(), maxsplit=1)[0]
 
 
 def upper(text: str) -> str:

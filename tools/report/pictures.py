@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -13,13 +14,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arrays import Array
 
 if TYPE_CHECKING:
+    from weldcal.calibration.flange.fit import FlangeFit
     from weldcal.calibration.flange.observation import Observation
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
@@ -98,6 +101,39 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
         axes.margins(0.15)
     left.set_title(f"errors, enlarged {scale:.0f} times", fontsize=9, loc="left")
     return svg(figure, left, right)
+
+
+MOST_SCANS = 48  # a choice: a page of eight rows; more would take megabytes and seconds
+_POINTS = 1500  # drawn a scan: a choice, dense at this size
+_HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good scanner
+
+
+def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) -> bytes:
+    """Each scan's points (N, 3) m of C about its flange, seen along the found normal, with the found edges; PNG.
+
+    Colours: height above the found face. The first MOST_SCANS scans are drawn.
+    """
+    ids = [id for id in clouds if id in fits][:MOST_SCANS]
+    columns = 6
+    rows = -(-len(ids) // columns)
+    figure = Figure(figsize=(8.2, 1.5 * rows + 0.1), layout="constrained")
+    for axes, id in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, ids):
+        axes.set_axis_off()
+        if id is None:
+            continue
+        fit = fits[id]
+        R = RotationMatrix.MakeFromOneVector(fit.normal_C, 2).matrix()
+        points = 1e3 * (clouds[id][:: len(clouds[id]) // _POINTS + 1] - fit.center_C) @ R
+        axes.scatter(*points.T[:2], c=points[:, 2], s=0.6, cmap="coolwarm", vmin=-_HEIGHT_MM, vmax=_HEIGHT_MM)
+        for radius in (fit.outer_radius_m, fit.bore_radius_m):
+            if radius is not None:
+                axes.add_patch(Circle((0.0, 0.0), 1e3 * radius, fill=False, color="#111", linewidth=0.8))
+        axes.plot(0.0, 0.0, "+", color="#111", markersize=5, markeredgewidth=0.8)
+        axes.set_aspect("equal")
+        axes.set_title(id, fontsize=7, pad=2)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=120, metadata={"Software": None}, facecolor="white")
+    return stream.getvalue()
 
 
 def subplots(width: float, height: float, *grid: int, **settings: Any) -> tuple[Figure, Any]:

@@ -12,8 +12,10 @@ import numpy as np
 import open3d
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from typer.testing import CliRunner
 
 import weldcal
+from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.results import (
     CalibrationResult,
     IcpRecord,
@@ -30,6 +32,8 @@ from weldcal.calibration.data.results import (
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
+from weldcal.tools.cli.app import app
+from weldcal.tools.commands.apply import applied
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -212,7 +216,35 @@ def test_a_result_corrects_points_and_names_how(result: CalibrationResult, tmp_p
         corrected.correct(np.ones((5, 4)))
     file = save_result(corrected, tmp_path)
     note = correction_note(corrected, file) or ""
-    assert f"The correction is in {file}, scanner_correction" in note
+    assert f"weldcal apply {file} CLOUD" in note
     assert "multiply" not in note
-    call = note.split("in Python: ")[1].rstrip(".")
+    call = note.split("in Python ")[1].rstrip(".")
     assert eval(call, {"weldcal": weldcal, "points": points})[0] == pytest.approx(corrected.correct(points)[0])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+@pytest.mark.parametrize("form", [".ply", ".npy", ".csv", ".pcd"])
+def test_apply_corrects_a_cloud_and_maps_it_into_the_base(
+    result: CalibrationResult, tmp_path: Path, form: str, unit: float
+) -> None:
+    points = np.random.default_rng(4).uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 0.9], (200, 3))
+    file = save_result(replace(result, scanner_correction={"scale": 1.002, "gradient_per_m": [0.01, -0.01]}), tmp_path)
+    np.save(tmp_path / "scan.npy", unit * np.vstack([points, np.full(3, np.nan)]))
+    for base, matrix in ((False, np.eye(4)), (True, result.X_BC.GetAsMatrix4())):
+        written = tmp_path / f"{base}{form}"
+        call = ["apply", str(file), str(tmp_path / "scan.npy"), str(written), "--json"] + ["--base"] * base
+        told = CliRunner().invoke(app, call)
+        assert told.exit_code == 0, told.output
+        assert json.loads(told.stdout)["unit"] == ("m" if unit == 1.0 else "mm")
+        scale = 1.002 + 0.01 * points[:, :1] - 0.01 * points[:, 1:2]
+        expected = (points * scale) @ matrix[:3, :3].T + matrix[:3, 3]
+        found = read_cloud(written) / unit
+        assert found[np.isfinite(found).all(axis=1)] == pytest.approx(expected, abs=1e-7)
+    again = CliRunner().invoke(app, call)
+    assert again.exit_code == 1
+    assert "--overwrite" in again.output
+
+
+def test_apply_refuses_the_base_for_a_scanner_on_the_arm(result: CalibrationResult) -> None:
+    with pytest.raises(InputError, match="X_BF X_FC"):
+        applied(replace(result, configuration="eye_in_hand"), np.zeros((3, 3)), base=True)

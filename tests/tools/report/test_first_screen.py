@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
+from weldcal.tools.cli import options
 from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
@@ -84,6 +86,27 @@ def test_what_is_good_to_know_is_not_said_to_be_wrong() -> None:
     both = screen(Findings(concerns=["First."], notes=["First.", "Second.", "Third.", "Fourth.", "Fifth."]))
     assert both.notes == ("Second.", "Third.", "2 more are listed in the report.")
     assert "good to know" not in screen(Findings(concerns=["First."])).rows()
+
+
+LONG = "The poses hardly differ in orientation, so they cannot show a tool centre point that is set at the robot. More."
+
+
+@pytest.mark.parametrize("concerns", [0, 1, 2, 5])
+@pytest.mark.parametrize("notes", [0, 1, 4])
+def test_the_terminal_shows_the_verdict_first_on_at_most_twelve_lines(
+    capsys: pytest.CaptureFixture[str], concerns: int, notes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    found = Findings(concerns=[f"c{k} {LONG}" for k in range(concerns)], notes=[f"n{k} {LONG}" for k in range(notes)])
+    options._emit_first("calibrate", screen(found), Path("out"))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"calibrate: {CARE}")
+    assert len(lines) <= 12, lines
+    text = " ".join(" ".join(lines).split())
+    assert "weldcal verify out NEW_SCANS" in text
+    assert "650.000, -20.000, 940.000 mm" in text
+    assert "0.213 mm" in text
+    assert (f"c0 {LONG}".removesuffix(" More.") in text) == (concerns > 0), "the gravest concern is always there"
 
 
 def test_every_form_of_a_pose_to_copy_is_the_same_pose() -> None:

@@ -3,16 +3,22 @@ screen."""
 
 from __future__ import annotations
 
+import io
 import re
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
+from pydrake.math import RotationMatrix
 
 from tests.browser import Browser
 from tests.tools.report.small_outcomes import PAGES, Made
+from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.tools.report.first_screen import CARE, DO_NOT, USE
+from weldcal.tools.report.pictures import scan_pictures
 from weldcal.tools.report.render import inline_svg
 
 VERDICTS = {"calibrate": CARE, "verify": CARE, "monitor": DO_NOT, "hand_eye": CARE, "demo": CARE, "held": DO_NOT}
@@ -145,3 +151,29 @@ def test_a_page_fits_a_phone_is_dark_at_night_and_copies(name: str, browser: Bro
     finally:
         browser.dark(False)
         browser.resize(1280, 800)
+
+
+def test_the_picture_of_a_scan_shows_the_found_edge_where_the_points_end() -> None:
+    normal = np.array([0.3, -0.5, -0.8]) / np.linalg.norm([0.3, -0.5, -0.8])
+    R = RotationMatrix.MakeFromOneVector(normal, 2).matrix()
+    angle = np.linspace(0.0, 2.0 * np.pi, 1400)
+    centre = np.array([0.1, -0.2, 0.9])
+    ring = centre + 0.03 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) @ R.T + 2e-4 * normal
+    fit = FlangeFit(
+        center_C=centre,
+        normal_C=normal,
+        center_covariance=np.eye(3),
+        normal_sigma=0.0,
+        plane_rms_m=0.0,
+        rim_rms_m=0.0,
+        outer_radius_m=0.036,
+        bore_radius_m=None,
+        n_points=1400,
+        n_rim=200,
+        coverage=1.0,
+    )
+    pixels = imread(io.BytesIO(scan_pictures({"p0": ring, "unfitted": ring}, {"p0": fit})))[20:, :, :3]
+    black, coloured = pixels.max(axis=2) < 0.3, pixels[:, :, 0] > pixels[:, :, 2] + 0.3
+    (low, high), (inner, outer) = (np.nonzero(found.any(axis=0))[0][[0, -1]] for found in (black, coloured))
+    assert abs((low + high) - (inner + outer)) <= 4, "the ring of points is about the found centre"
+    assert (outer - inner) / (high - low) == pytest.approx(0.03 / 0.036, abs=0.05)
