@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    from weldcal.models.exports import exported
+    from weldcal.models import exported
 
     _load, _names = exported(__name__)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_ax_yb, solve_axb_ycz
     from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 else:
-    from weldcal.models.exports import exported
+    from weldcal.models import exported
 
     __getattr__, __dir__ = exported(__name__)
 

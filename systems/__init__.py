@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from weldcal.systems.station import Station
     from weldcal.systems.wiring import Replacement, Wiring
 else:
-    from weldcal.models.exports import exported
+    from weldcal.models import exported
 
     __getattr__, __dir__ = exported(__name__)
 

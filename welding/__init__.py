@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingCommand, WeldingState
     from weldcal.welding.servo.step import welding_step
 else:
-    from weldcal.models.exports import exported
+    from weldcal.models import exported
 
     __getattr__, __dir__ = exported(__name__)
 
