@@ -222,5 +222,6 @@ def test_type_checkers_of_a_users_project_find_weldcal(built: Built, tmp_path: P
     assert [line + 1 for line in unknown] == [3, 4, 5, 6], notes
     revealed = [note["message"].split(" is ", 1)[1] for note in notes if note["severity"] == "information"]
     assert revealed[0] == '"str"'
-    assert revealed[1].startswith('"(points_C: ndarray[')
+    assert revealed[1].startswith('"(points_C: ')
+    assert ") -> ndarray[" in revealed[1]
     assert "Unknown" not in revealed[1]
