@@ -2,10 +2,14 @@
 
 Frame R: origin at the circle centre in the plane of the flat face, z the outward face normal; the body lies at z < 0.
 
-Where the numbers come from. Pitch circle, number of holes and thread are the designation itself. Outside diameters and
-bores follow the standard's R10 series (each size is the next pitch circle up, and half of it). They and the dowels of
-the 31,5, 40 and 50 sizes agree with vendors' manuals (Universal Robots, Robotiq, Schunk). The dowels of 125 and 160,
-the bore depths and the hole angles of the six-hole sizes are not confirmed: measure before relying on them.
+Where the numbers come from:
+
+- Pitch circle, holes, thread, bore, dowel: ISO 9409-1:2004, Table 1, as public CAD sources quote it. Outside: its d2.
+  The edition of 1996 has M5 on 40, six holes on 63 and eight on 160; robots with six on 63 are still sold.
+- The dowel hole midway between two holes: User Manuals UR10e, 8.7.5 (four holes) and UR20, 8.11.3 (six holes).
+- Bore depth 6 mm, threads 8 mm deep: measured on Universal Robots' UR5 mesh (wrist3.dae). UR3e, UR5e, UR10e and UR20
+  have bores of 6.2 mm. For the sizes other than 50 and 80 the depth is a choice.
+- Chamfer 1 mm: the same meshes (1.05 mm on the UR20).
 """
 
 import math
@@ -98,7 +102,7 @@ class FlangeStandard:
 
 
 def _iso(pitch: str, n: int, thread: int, outer: float, bore: float, bore_depth: float, pin: float) -> FlangeStandard:
-    """One row of the table, in millimetres; the dowel sits at 90 deg, midway between two of the even holes."""
+    """One row of the table, in millimetres; the dowel hole at 90 degrees, midway between two of the even holes."""
     first = math.pi / 2 + math.pi / n
     angles = tuple(sorted((first + 2.0 * math.pi * k / n) % (2.0 * math.pi) for k in range(n)))
     return FlangeStandard(
@@ -149,6 +153,7 @@ STANDARDS: dict[str, FlangeStandard] = {
         _iso("40", 4, 6, 50.0, 25.0, 6.0, 6.0),
         _iso("50", 4, 6, 63.0, 31.5, 6.0, 6.0),
         _iso("63", 4, 6, 80.0, 40.0, 6.0, 6.0),
+        _iso("63", 6, 6, 80.0, 40.0, 6.0, 6.0),
         _iso("80", 6, 8, 100.0, 50.0, 6.0, 8.0),
         _iso("100", 6, 8, 125.0, 63.0, 6.0, 8.0),
         _iso("125", 6, 10, 160.0, 80.0, 6.0, 10.0),
@@ -165,7 +170,7 @@ STANDARDS: dict[str, FlangeStandard] = {
 def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStandard:
     """The flange of that designation, also as catalogues write it ("ISO 9409-1 - 50 - 4 - M6", "50-4-M6").
 
-    `pin_angle_rad` moves the dowel (90 deg on most arms, 180 deg on Franka).
+    `pin_angle_rad` moves the dowel hole, which is at 90 degrees otherwise.
 
     Raises InputError naming the known ones.
     """

@@ -1,6 +1,6 @@
 """Supported robots: flange, payload, reach, and the sources of their numbers."""
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
@@ -42,42 +42,45 @@ ISO_50, ISO_80 = "iso9409-1-50-4-m6", "iso9409-1-80-6-m8"
 CLOSED_FORM, NUMERIC = "closed form", "numeric"
 """How joint angles are found: every solution (arms.inverse), or one by iteration (arms.chain)."""
 
-CATALOGUE = ("flange", "payload", "reach", "repeatability", "joint limits")
-"""What a maker's data sheet says of a robot, beside its kinematics."""
+FACTS = ("flange", "dowel", "payload", "reach", "repeatability", "joint limits", "kinematics", "TCP")
+"""What is stated of a robot, each with its source."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """One robot.
+    """One robot. A fact that no public document states is None or empty, and ``sources`` does not name it.
 
-    ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's working
-    radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
-    Joint limits and kinematics are the arm's own files (`chain`). ``confirmed`` holds which of CATALOGUE a public
-    source bears out, and that source; what is not there is written from memory of the maker's data sheet.
+    Attributes:
+        name: as in a scenario.
+        title: maker and model.
+        joints: number of them.
+        flange: ISO 9409-1 designation.
+        dowel_deg: direction of the dowel hole about z of the tool frame (TCP at zero), from x.
+        payload_kg: in the whole working range.
+        reach_m: the maker's working radius.
+        repeatability_m: of the pose, by ISO 9283.
+        tcp: where its TCP is read.
+        inverse: how its joint angles are found.
+        sources: document and section by entry of FACTS.
     """
 
     name: str
     title: str
     joints: int
     flange: str
-    pin_angle_rad: float
+    dowel_deg: float | None
     payload_kg: float
     reach_m: float
-    repeatability_m: float
+    repeatability_m: float | None
+    tcp: str
     inverse: str
-    source: str
-    confirmed: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def unconfirmed(self) -> tuple[str, ...]:
-        """The entries of CATALOGUE that no public source was found for."""
-        found = {what for what, _ in self.confirmed}
-        return tuple(what for what in CATALOGUE if what not in found)
+    sources: Mapping[str, str]
 
     @property
     def standard(self) -> FlangeStandard:
-        """The flange to look for."""
-        return get_flange(self.flange, pin_angle_rad=self.pin_angle_rad)
+        """The flange to look for. Its dowel hole is at 90 degrees for every robot: a calibration's axis turn is
+        measured from there."""
+        return get_flange(self.flange)
 
     @property
     def chain(self) -> Chain:
@@ -85,139 +88,168 @@ class Robot:
         return load_chain(self.name)
 
 
-_UR_E = "user manual, e-Series, technical specifications; kinematics: Universal Robots, DH parameters"
-_UR_CB3 = "user manual, CB3, technical specifications; kinematics: Universal Robots, DH parameters (series 3)"
-_UR_TWIN = (
-    "technical specifications; kinematics: Universal Robots, ROS 2 description, as the predecessor of the same build"
-)
-_UR_LARGE = (
-    "technical specifications (UR20, UR30: the smaller of two published payloads); kinematics: Universal Robots, DH"
-    " parameters"
-)
-_RIGHT_ANGLE = math.pi / 2
-
-
-_SCANS = "pattern of holes and dowel in the recorded scans and their CAD"
-_DESCRIPTION = "ur_description (URDF of ROS-Industrial)"
-_SERIES = "table of models in the API catalogue of Universal Robots (api-evangelist/universal-robots)"
-_FLANGES = "graspmonkey.de, ISO 9409-1 (table of robots): UR20 and UR30 have ISO 9409-1-80-6-M8"
-CONFIRMED: dict[str, tuple[tuple[str, str], ...]] = {
-    "ur5": (
-        ("flange", _SCANS),
-        ("payload", "user manual UR5/CB3 3.4.5, appendix A: 5 kg"),
-        ("joint limits", _DESCRIPTION),
-    ),
-    "ur5e": (("payload", "hardware manual UR5e 2022, chapter 9: 5 kg"), ("joint limits", _DESCRIPTION)),
-    "ur7e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
-    "ur10e": (
-        ("flange", _SCANS),
-        ("payload", "online manual UR10e, software 10.6, Maximum Payload: 10 or 12.5 kg, by the label on the arm"),
-        ("reach", "the same page: work space of 1300 mm"),
-    ),
-    "ur12e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
-    "ur16e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
-    "ur20": (
-        ("flange", _FLANGES),
-        ("payload", "rocketfarm.no, UR20 cobot for palletizing: 20 kg (later labels say 25 kg)"),
-        ("reach", "the same page: 1750 mm"),
-        ("joint limits", _DESCRIPTION),
-    ),
-    "ur30": (("flange", _FLANGES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
-    "franka_panda": (
-        ("flange", _SCANS),
-        ("payload", "Elsner 2023, after the maker: 3 kg"),
-        ("reach", "Elsner 2023: 0.855 m"),
-        ("repeatability", "Elsner 2023: 0.1 mm"),
-        ("joint limits", "FCI documentation, control parameters; the same in Elsner 2023"),
-    ),
-    "franka_fr3": (("joint limits", "franka_rust 0.1.14 on docs.rs, FrankaFR3"),),
-    "aubo_i5": (
-        ("flange", _SCANS),
-        ("payload", "AUBO's aubo_description: the number in the name is the load in kg"),
-        ("reach", "sum of the published a2, a3 and d5: 0.408 + 0.376 + 0.1025 m"),
-        ("joint limits", "AUBO's aubo_description: 175 degrees either way"),
-    ),
-}
-"""By robot: what of CATALOGUE could be looked up, and where."""
+# A document that is not open as a whole was read as public repositories quote it.
+_UR_MESH = "meshes of Universal_Robots_ROS2_Description, {}/visual/wrist3.dae"
+_SCANS = "pattern of holes and dowel in the recorded scans"
+_MODELS = "table of models in api-evangelist/universal-robots"
+_HUB = "industrialroboticshub.com, Robot Tool Flange Sizes by Brand"
+_ELSNER = "Elsner 2023, after the maker"
 
 
 def _ur(
-    name: str, title: str, payload: float, reach: float, repeatability: float, source: str, flange: str = ISO_50
+    model: str,
+    numbers: tuple[float, float, float | None],
+    sheet: str,
+    mesh: str = "",
+    designation: str = ISO_50,
+    **sources: str,
 ) -> Robot:
-    known = CONFIRMED.get(name, ())
+    """A robot of Universal Robots: payload (kg), reach and repeatability (m) from ``sheet`` but for what ``sources``
+    names; ``mesh`` shows the dowel hole at -y of the tool frame."""
+    payload, reach, repeatability = numbers
+    name = model.lower()
+    stated = dict.fromkeys(("flange", "payload", "reach", "repeatability"), sheet) | sources
+    if repeatability is None:
+        del stated["repeatability"]
+    if mesh:
+        stated["dowel"] = _UR_MESH.format(mesh)
+    stated["joint limits"] = (
+        f"Universal_Robots_ROS2_Description, config/{name}/joint_limits.yaml; the elbow's 180 degrees are its choice"
+    )
+    stated["kinematics"] = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
+    stated["TCP"] = "User Manual UR5e, 10.4.2; Universal_Robots_Client_Library, rtde_output_recipe.txt"
     return Robot(
         name=name,
-        title=title,
+        title=f"Universal Robots {model}",
         joints=6,
-        flange=flange,
-        pin_angle_rad=_RIGHT_ANGLE,
+        flange=designation,
+        dowel_deg=270.0 if mesh else None,
         payload_kg=payload,
         reach_m=reach,
         repeatability_m=repeatability,
+        tcp="pendant: Installation > General > TCP; RTDE: tcp_offset",
         inverse=CLOSED_FORM,
-        source=source,
-        confirmed=known,
+        sources=stated,
+    )
+
+
+def _franka(name: str, title: str, **sources: str) -> Robot:
+    """A Franka arm. The maker's meshes disagree on the dowel hole (hand.dae: +x, link7.dae: +y)."""
+    return Robot(
+        name=name,
+        title=title,
+        joints=7,
+        flange=ISO_50,
+        dowel_deg=None,
+        payload_kg=3.0,
+        reach_m=0.855,
+        repeatability_m=1e-4,
+        tcp="libfranka: F_T_EE of RobotState",
+        inverse=NUMERIC,
+        sources=sources
+        | {
+            "kinematics": "franka_description, robots/fer/kinematics.yaml; FCI documentation, Denavit-Hartenberg"
+            " parameters",
+            "joint limits": "FCI documentation, Robot and interface specifications",
+            "TCP": "libfranka, RobotState; franka_ros, franka_model_interface.h",
+        },
     )
 
 
 ROBOTS: dict[str, Robot] = {
     robot.name: robot
     for robot in (
-        _ur("ur3e", "Universal Robots UR3e", 3.0, 0.500, 3e-5, _UR_E),
-        _ur("ur5", "Universal Robots UR5", 5.0, 0.850, 1e-4, _UR_CB3),
-        _ur("ur5e", "Universal Robots UR5e", 5.0, 0.850, 3e-5, _UR_E),
-        _ur("ur7e", "Universal Robots UR7e", 7.5, 0.850, 3e-5, _UR_TWIN),
-        _ur("ur10", "Universal Robots UR10", 10.0, 1.300, 1e-4, _UR_CB3),
-        _ur("ur10e", "Universal Robots UR10e", 12.5, 1.300, 5e-5, _UR_E),
-        _ur("ur12e", "Universal Robots UR12e", 12.5, 1.300, 5e-5, _UR_TWIN),
-        _ur("ur16e", "Universal Robots UR16e", 16.0, 0.900, 5e-5, _UR_E),
-        _ur("ur20", "Universal Robots UR20", 20.0, 1.750, 1e-4, _UR_LARGE, ISO_80),
-        _ur("ur30", "Universal Robots UR30", 30.0, 1.300, 1e-4, _UR_LARGE, ISO_80),
-        Robot(
-            name="franka_panda",
-            title="Franka Emika Panda",
-            joints=7,
-            flange=ISO_50,
-            pin_angle_rad=math.pi,
-            payload_kg=3.0,
-            reach_m=0.855,
-            repeatability_m=1e-4,
-            inverse=NUMERIC,
-            source=(
-                "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the"
-                " recorded scans' CAD"
-            ),
-            confirmed=CONFIRMED["franka_panda"],
+        _ur("UR3e", (3.0, 0.500, 3e-5), "User Manual UR3e, 2.1", "ur3e", flange="UR3e data sheet, Tool Flange"),
+        _ur(
+            "UR5",
+            (5.0, 0.850, 1e-4),
+            "UR5 Technical specifications, item 110105",
+            flange="holes of the recorded scans' CAD",
+            payload="User Manual UR5/CB3 3.4.5, appendix A",
         ),
-        Robot(
-            name="franka_fr3",
-            title="Franka Research 3",
-            joints=7,
-            flange=ISO_50,
-            pin_angle_rad=math.pi,
-            payload_kg=3.0,
-            reach_m=0.855,
-            repeatability_m=1e-4,
-            inverse=NUMERIC,
-            source="Franka Research 3 data sheet; limits and kinematics: franka_description; dowel as on the Panda",
-            confirmed=CONFIRMED["franka_fr3"],
+        _ur("UR5e", (5.0, 0.850, 3e-5), "User Manual UR5e, 2.1", "ur5e", flange="User Manual UR5e, figure 4.2"),
+        _ur("UR7e", (7.5, 0.850, 3e-5), "UR7e Technical Specification", "ur5e"),
+        _ur(
+            "UR10",
+            (10.0, 1.300, 1e-4),
+            "UR10 Technical specifications, item 110110",
+            "ur10",
+            flange=f"holes in {_UR_MESH.format('ur10')}",
+        ),
+        _ur(
+            "UR10e",
+            (12.5, 1.300, 5e-5),
+            "UR10e Technical Specification, May 2025",
+            "ur10e",
+            flange="User Manual UR10e (SW 5.19), 8.7.5 Securing Tool",
+            payload="UR10e Technical Specification, May 2025; 10 kg if the label says so (online manual, Maximum"
+            " Payload)",
+        ),
+        _ur(
+            "UR12e",
+            (12.5, 1.300, 5e-5),
+            _MODELS,
+            "ur10e",
+            flange=_HUB,
+            repeatability="UR10e Technical Specification: by Universal_Robots_ROS2_Description, config/ur12e, the same"
+            " arm",
+        ),
+        _ur("UR16e", (16.0, 0.900, 5e-5), "UR16e Technical Specification", "ur10e", flange=_HUB),
+        _ur(
+            "UR20",
+            (20.0, 1.750, 1e-4),
+            "UR20 Technical Specification",
+            "ur20",
+            designation=ISO_80,
+            flange="User Manual UR20 (SW 5.21), 8.11.3 Securing Tool",
+            payload="User Manual UR20 (SW 5.19), 2.1; 25 kg with the tool pointing down (2.2)",
+        ),
+        _ur(
+            "UR30",
+            (30.0, 1.300, None),
+            _MODELS,
+            "ur20",
+            designation=ISO_80,
+            flange="graspmonkey.de, ISO 9409-1, table of robots",
+            payload="UR30 data sheet; 35 kg under the maker's conditions",
+        ),
+        _franka(
+            "franka_panda",
+            "Franka Emika Panda",
+            flange=f"{_SCANS}; Franka Hand product manual 1.2 (DIN ISO 9409-1-A50)",
+            payload=_ELSNER,
+            reach=_ELSNER,
+            repeatability=_ELSNER,
+        ),
+        _franka(
+            "franka_fr3",
+            "Franka Research 3",
+            **dict.fromkeys(("flange", "payload", "reach", "repeatability"), "Datasheet Franka Research 3, R02212 2.6"),
         ),
         Robot(
             name="aubo_i5",
             title="AUBO i5",
             joints=6,
             flange=ISO_50,
-            pin_angle_rad=_RIGHT_ANGLE,
+            dowel_deg=90.0,
             payload_kg=5.0,
             reach_m=0.8865,
             repeatability_m=5e-5,
+            tcp="",
             inverse=NUMERIC,
-            source="AUBO i5 user manual (not confirmed by a second source); kinematics: AUBO's aubo_i5.urdf",
-            confirmed=CONFIRMED["aubo_i5"],
+            sources={
+                "flange": _SCANS,
+                "dowel": f"{_SCANS}; aubo_description, meshes/aubo_i5/visual/link6.DAE",
+                "payload": "aubo_description, README: the number in the name",
+                "reach": "sum of a2, a3 and d5 in aubo_description; AUBO i series product data",
+                "repeatability": "AUBO i series product data",
+                "joint limits": "aubo_description, README (175 degrees) and urdf/aubo_i5.urdf (speeds)",
+                "kinematics": "aubo_description, urdf/aubo_i5.urdf",
+            },
         ),
     )
 }
-"""Every robot known by name; the ISO 9409-1 designation of each in one place."""
+"""Every robot known by name."""
 
 CONTROLLER_MODELS: dict[str, tuple[str, int]] = {
     "ur3e": ("UR3", 3),

@@ -112,8 +112,10 @@ def looks_wrong(one: CauseFit) -> bool:
 
 
 def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else
-    None."""
+    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
+
+    Else None.
+    """
     found: list[Reading] = []
     for cause, words, given, other in _misreadings(case):
         one = fit(other)
@@ -164,8 +166,10 @@ def _scaled(case: DoctorCase, what: str, factor: Array) -> DoctorCase:
 
 @dataclass(frozen=True, eq=False)
 class DirectCause:
-    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its
-    numbers."""
+    """A cause that shows without a model of the residuals.
+
+    Its name, its weight (twice a log-likelihood ratio) and its numbers.
+    """
 
     cause: str
     score: float
@@ -174,8 +178,10 @@ class DirectCause:
 
 
 def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
-    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their
-    errors)."""
+    """Single scans that disagree with all others, each of them anywhere.
+
+    Uniform in the ball that holds their errors.
+    """
     r = np.linalg.norm(null.e, axis=1)
     scale = max(float(np.median(r)) / 1.5382, 2e-5)
     bad = r > _GROSS * scale
@@ -201,8 +207,10 @@ def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def sure_outliers(case: DoctorCase, null: CauseFit) -> DirectCause | None:
-    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the
-    residuals."""
+    """Find single scans whose errors are far too large for scans that agree.
+
+    Such errors would show once in a thousand sets, by Student's t of the residuals.
+    """
     r = np.linalg.norm(null.e, axis=1)
     chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
     bad = (chance * case.n < _ODD) & (r > _GROSS_M)
@@ -283,8 +291,7 @@ def too_alike(case: DoctorCase) -> DirectCause | None:
 
 
 def installation(case: DoctorCase, one: CauseFit) -> DirectCause | None:
-    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans
-    agree."""
+    """Compare the camera's place with a measured one, beyond the measurement's stated error, while all scans agree."""
     if case.guess is None:
         return None
     seen = case.c @ one.R[0].T + one.p[0]
@@ -316,8 +323,10 @@ def _off(u: Array, z: Array) -> float:
 
 
 def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both
-    agree."""
+    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
+
+    None where both agree.
+    """
     seen = np.asarray(np.isfinite(case.m).all(axis=1))
     if seen.sum() < 5:
         return None
@@ -356,9 +365,11 @@ CLEAR = 1.2  # factor by which a cause must bring the median residual down
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the
-    log-likelihood ratio less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and
-    the scans ``where`` it shows.
+    """A named cause with the evidence for it.
+
+    ``confidence`` 0 to 1 is its weight among the models that were compared, ``score`` twice the log-likelihood ratio
+    less the cost of its numbers. ``numbers`` are the evidence, ``words`` those of a misreading, and ``where`` the scans
+    that show it.
     """
 
     name: str
@@ -371,8 +382,10 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them
-    best."""
+    """The causes, likeliest first.
+
+    The number of scans, and the spread (m) of their centres about what explains them best.
+    """
 
     causes: tuple[Cause, ...]
     n: int

@@ -1,5 +1,7 @@
-"""Held-out errors of a calibration: k-fold cross-validation, convergence over the number of scans, intervals of new
-errors."""
+"""Held-out errors of a calibration.
+
+k-fold cross-validation, convergence over the number of scans, intervals of new errors.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -45,6 +47,11 @@ def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Ar
     return np.array(out)
 
 
+def _plain(config: SolveConfig) -> Solve:
+    """The plain estimate, which takes the scanner as it is."""
+    return lambda observations: (estimate_eye_on_base(observations, config).X_BC, ScannerCorrection())
+
+
 def k_fold(
     observations: Sequence[Observation],
     *,
@@ -72,9 +79,7 @@ def k_fold(
             held = set(test.tolist())
             train = [o for i, o in enumerate(observations) if i not in held]
             try:
-                X, correction = (
-                    (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
-                )
+                X, correction = (solve or _plain(plain))(train)
             except InputError:
                 continue
             errors[r, test] = position_errors(X, [corrected_observation(correction, observations[i]) for i in test])
@@ -113,8 +118,10 @@ class Algorithm1Run:
 def run_algorithm1(
     observations: Sequence[Observation], verification: Verifier, *, cost: Cost = translation_cost
 ) -> Algorithm1Run | None:
-    """Feed all observations, in order, to Algorithm 1 without a stop at a required error; None if it never
-    registered."""
+    """Feed all observations, in order, to Algorithm 1 without a stop at a required error.
+
+    None if it never registered.
+    """
     state = algorithm1_start(e_required=1e-12, k_max=max(1, len(observations)))
     counts, figures, path = [], [], []
     for used, o in enumerate(observations, start=1):
@@ -147,8 +154,10 @@ def convergence(
     seed: int = 0,
     solve: Solve | None = None,
 ) -> Convergence:
-    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11; at least two scans
-    judge. ``solve`` replaces the plain estimate, as in k_fold."""
+    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11.
+
+    At least two scans judge. ``solve`` replaces the plain estimate, as in k_fold.
+    """
     n = len(observations)
     counts = np.unique(np.concatenate([np.arange(4, 10), np.round(np.geomspace(9, max(n, 10), 8)).astype(int)]))
     counts = counts[counts <= n - 2]
@@ -162,11 +171,7 @@ def convergence(
         for k, m in enumerate(counts):
             rows = slice(r * n, r * n + n - int(m))
             try:
-                X, correction = (
-                    (estimate_eye_on_base(shuffled[:m], config).X_BC, ScannerCorrection())
-                    if solve is None
-                    else solve(shuffled[:m])
-                )
+                X, correction = (solve or _plain(config))(shuffled[:m])
                 seen = correction.points(np.array([o.p_CR for o in shuffled[m:]]))
                 p_B = np.array([o.p_BR for o in shuffled[m:]])
                 held_out[rows, k] = np.linalg.norm(X.multiply(seen.T).T - p_B, axis=1)
@@ -180,8 +185,9 @@ def convergence(
 
 
 def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | None:
-    """Interval in which the mean error of as many new poses lies with that probability; None for fewer than four
-    errors.
+    """Interval in which the mean error of as many new poses lies with that probability.
+
+    None for fewer than four errors.
 
     From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the
     coefficient of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees
@@ -199,8 +205,9 @@ def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | N
 def bootstrap_interval(
     errors: Array, share: float = 0.5, level: float = 0.95, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Interval in which the quantile ``share`` of as many new errors lies with that probability; None for fewer than
-    four errors.
+    """Interval in which the quantile ``share`` of as many new errors lies with that probability.
+
+    None for fewer than four errors.
 
     From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what
     comes, and the ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani

@@ -1,5 +1,7 @@
-"""What errors of the arm, unknown but as large as makers leave them, do to touches after a calibration that was made
-with the same arm."""
+"""Predict what unknown errors of the arm do to touches after a calibration with the same arm.
+
+The errors are as large as makers leave them.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,10 @@ _USUAL_POSTURE = np.radians([-90.0, 110.0, -110.0, -90.0, 0.0])  # of the second
 def observed_document(
     observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
 ) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
-    joints where known."""
+    """The poses that a calibration used, for CalibrationResult.observed.
+
+    Feature in the base, seen centre and normal, joints where known.
+    """
     X = X_FR or RigidTransform()
     return {
         "feature_xyz": [float(v) for v in X.translation()],
@@ -63,8 +67,10 @@ def arm_effect(
     X_BF: Sequence[RigidTransform],
     q_tips: Sequence[Array | None],
 ) -> ArmEffect | None:
-    """Changes of scanned minus touched at n tips (flange poses ``X_BF``, joint angles where known) by k errors of the
-    arm, each of one standard deviation of a maker's (FactoryPrior).
+    """Return changes of scanned minus touched at n tips by k errors of the arm.
+
+    The tips have flange poses ``X_BF``, and joint angles where known. Each error is one standard deviation of a maker's
+    (FactoryPrior).
 
     The calibration has seen the same errors and bent to them: with e = A d + B u at its poses (d: camera pose and
     scanner correction, u: errors of the arm) it finds d = -G u, G = (A' W A + P)^-1 A' W B, and a touch errs by (B_t -
@@ -123,8 +129,10 @@ def arm_effect(
 
 
 def _joints(robot: str, X_BF: Sequence[RigidTransform], known: Sequence[Array | None]) -> Array | None:
-    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up; None out of
-    reach."""
+    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up.
+
+    None out of reach.
+    """
     arm = load_arm(robot)
     p = np.mean([X.translation() for X in X_BF], axis=0)
     near = np.append(np.arctan2(p[1], p[0]) + np.pi, _USUAL_POSTURE)

@@ -31,14 +31,40 @@ def test_the_cobot_flange_has_the_dimensions_of_the_standard() -> None:
     assert math.degrees(f.pin_angle_rad) == pytest.approx(90)
 
 
-def test_every_size_follows_the_preferred_number_series() -> None:
+# ISO 9409-1:2004, Table 1 (mm): d1, N, thread, d2, d3, d5; and the second number of holes that is sold on 63
+TABLE = (
+    (31.5, 4, "M5", 40, 20, 5),
+    (40, 4, "M6", 50, 25, 6),
+    (50, 4, "M6", 63, 31.5, 6),
+    (63, 4, "M6", 80, 40, 6),
+    (63, 6, "M6", 80, 40, 6),
+    (80, 6, "M8", 100, 50, 8),
+    (100, 6, "M8", 125, 63, 8),
+    (125, 6, "M10", 160, 80, 10),
+    (160, 6, "M10", 200, 100, 10),
+)
+
+
+def test_the_flanges_are_those_of_the_standard() -> None:
     iso = [f for f in STANDARDS.values() if f.n_holes]
-    assert [f.pitch_circle_m * 1e3 for f in iso] == pytest.approx([31.5, 40, 50, 63, 80, 100, 125, 160])
-    # The outside is two steps of R10 above the pitch circle, the bore is half the outside rounded to the series.
-    for f in iso:
+    rows = [(f.pitch_circle_m, f.n_holes, f.thread, f.outer_m, f.bore_m, f.pin_m) for f in iso]
+    assert [row[1:3] for row in rows] == [row[1:3] for row in TABLE]
+    for found, wanted in zip(rows, TABLE, strict=True):
+        assert [1e3 * found[k] for k in (0, 3, 4, 5)] == pytest.approx([wanted[k] for k in (0, 3, 4, 5)])
+
+
+def test_names_holes_and_dowel_of_a_flange_agree() -> None:
+    for f in (f for f in STANDARDS.values() if f.n_holes):
+        pitch, n, thread = f.designation.removeprefix("iso9409-1-").split("-")
+        assert (float(pitch) * 1e-3, int(n), thread.upper()) == (f.pitch_circle_m, f.n_holes, f.thread)
+        assert f.hole_m == pytest.approx(1e-3 * int(thread[1:]))
+        assert f.pin_m <= f.hole_m
+        # the outside is two steps of R10 above the pitch circle, the bore is half the outside rounded to the series
         assert f.outer_m / f.pitch_circle_m == pytest.approx(10**0.1, rel=0.02)
         assert f.bore_m / f.outer_m == pytest.approx(0.5, rel=0.01)
-        assert f.n_holes == len(f.hole_angles_rad)
+        # even holes, the dowel hole midway between two of them: 45 degrees off of four, 30 off of six
+        off = np.degrees(np.array(f.hole_angles_rad) - f.pin_angle_rad) % 360.0
+        np.testing.assert_allclose(np.sort(off), (np.arange(n := f.n_holes) + 0.5) * 360.0 / n)
 
 
 def test_the_paper_radius_lies_in_the_middle_of_the_chamfer() -> None:
@@ -51,9 +77,9 @@ def test_an_unknown_flange_is_answered_with_the_known_ones() -> None:
         get_flange("iso9409-1-51-4-m6")
 
 
-def test_the_dowel_can_be_moved_for_other_vendors() -> None:
-    franka = get_flange("iso9409-1-50-4-m6", pin_angle_rad=math.pi)
-    x, y, _ = franka.openings()[-1]
+def test_the_dowel_hole_can_be_moved() -> None:
+    moved = get_flange("iso9409-1-50-4-m6", pin_angle_rad=math.pi)
+    x, y, _ = moved.openings()[-1]
     np.testing.assert_allclose([x, y], [-0.025, 0.0], atol=1e-15)
 
 

@@ -15,7 +15,7 @@ from weldcal.models.arms.chain import chain_forward, chain_inverse, chain_jacobi
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.models.robots import CATALOGUE, CLOSED_FORM, ROBOTS, get_robot
+from weldcal.models.robots import CLOSED_FORM, FACTS, ROBOTS, get_robot
 from weldcal.models.scanners import SCANNERS
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def test_the_aubo_stands_where_its_lengths_put_it() -> None:
     chain = load_chain("aubo_i5")
     # upright at zero: the lengths of tubes and wrists add up, the joints' offsets lie sideways
     p = chain_forward(chain, np.zeros(6)).translation()
-    assert p[2] == pytest.approx(0.0985 + 0.408 + 0.376 + 0.1025, abs=1e-9)
+    assert p[2] == pytest.approx(0.122 + 0.408 + 0.376 + 0.1025, abs=1e-9)
     assert np.hypot(p[0], p[1]) == pytest.approx(0.1215 + 0.094, abs=1e-9)
     # the maker's reach is that of tubes and first wrist: a second source for the three lengths
     assert ROBOTS["aubo_i5"].reach_m == pytest.approx(0.408 + 0.376 + 0.1025, abs=1e-9)
@@ -157,9 +157,7 @@ def test_every_robot_has_a_flange_and_known_names_are_told() -> None:
     for robot in ROBOTS.values():
         large = robot.name in ("ur20", "ur30")
         assert robot.standard.designation == ("iso9409-1-80-6-m8" if large else "iso9409-1-50-4-m6")
-        assert robot.standard.pin_angle_rad == robot.pin_angle_rad
         assert (robot.inverse == CLOSED_FORM) == robot.name.startswith("ur")
-        assert robot.source
     assert get_robot("franka").name == "franka_panda"
     assert get_robot("UR10e").payload_kg == 12.5
     with pytest.raises(InputError, match="use one of ur3e"):
@@ -188,15 +186,28 @@ def test_the_command_lists_them() -> None:
     assert CliRunner().invoke(app, ["robots", "ur99"]).exit_code == 1
 
 
-def test_what_could_not_be_looked_up_is_called_unconfirmed() -> None:
+def test_each_number_has_a_source() -> None:
+    for robot in ROBOTS.values():
+        stated = {
+            "dowel": robot.dowel_deg is not None,
+            "repeatability": robot.repeatability_m is not None,
+            "TCP": bool(robot.tcp),
+        }
+        assert set(robot.sources) == {fact for fact in FACTS if stated.get(fact, True)}, robot.name
+        assert all(len(source) > 8 for source in robot.sources.values()), robot.name
+
+
+def test_a_robot_is_shown_with_its_sources() -> None:
     from weldcal.tools.cli.app import app
 
-    shown = CliRunner().invoke(app, ["robots", "ur3e"])
-    assert shown.exit_code == 0
-    assert "unconfirmed" in shown.output
-    assert "flange, payload, reach, repeatability, joint limits" in shown.output
+    shown = " ".join(CliRunner().invoke(app, ["robots", "ur5e"]).output.split())
+    for source in ROBOTS["ur5e"].sources.values():
+        assert source in shown
+    assert "?" not in shown
+    assert "not in a public source" not in shown
     lines = {line.split(" ")[0]: line for line in CliRunner().invoke(app, ["robots"]).output.splitlines()}
-    assert lines["ur3e"].count("?") == 4
-    assert lines["ur10e"].count("?") == 1  # its repeatability
-    for robot in ROBOTS.values():
-        assert {what for what, _ in robot.confirmed} | set(robot.unconfirmed) == set(CATALOGUE)
+    assert "?" not in "".join(lines.values())
+    assert lines["ur30"].split()[5] == "-"  # its repeatability
+    assert "repeatability not in a public source" in " ".join(
+        CliRunner().invoke(app, ["robots", "ur30"]).output.split()
+    )

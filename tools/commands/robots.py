@@ -34,7 +34,7 @@ def robots(
         str, typer.Argument(metavar="[NAME]", help="Show only this robot, joint by joint.", show_default=False)
     ] = "",
 ) -> Outcome:
-    """List the known robots: flange by ISO 9409-1, payload, reach, joint limits and the sources of the data."""
+    """List the known robots: flange by ISO 9409-1, payload, reach, joint limits; with NAME the source of each."""
     chosen = [get_robot(name)] if name else list(ROBOTS.values())
     summary = {"state": "done", "robots": [_row(robot) for robot in chosen]}
     return Outcome(summary, text=partial(_print_one, chosen[0]) if name else partial(_print_all, chosen))
@@ -47,10 +47,11 @@ def _row(robot: Robot) -> Mapping[str, object]:
         "name": robot.name,
         "title": robot.title,
         "flange": robot.flange,
-        "dowel_deg": math.degrees(robot.pin_angle_rad),
+        "dowel_deg": robot.dowel_deg,
         "payload_kg": robot.payload_kg,
         "reach_m": robot.reach_m,
-        "repeatability_mm": 1e3 * robot.repeatability_m,
+        "repeatability_mm": robot.repeatability_m and 1e3 * robot.repeatability_m,
+        "tcp": robot.tcp,
         "joints": [
             {
                 "name": joint,
@@ -61,9 +62,7 @@ def _row(robot: Robot) -> Mapping[str, object]:
             for k, joint in enumerate(chain.joint_names)
         ],
         "inverse_kinematics": robot.inverse,
-        "source": robot.source,
-        "confirmed": dict(robot.confirmed),
-        "unconfirmed": list(robot.unconfirmed),
+        "sources": dict(robot.sources),
     }
 
 
@@ -75,28 +74,33 @@ def _print_all(robots: list[Robot]) -> None:
     for k, heading in enumerate(("name", "flange", "dowel", "kg", "reach m", "± mm", "axes", "inverse")):
         table.add_column(heading, justify="right" if 2 <= k <= 6 else "left", no_wrap=True)
     for r in robots:
-        mark = {what: "?" if what in r.unconfirmed else "" for what in ("flange", "payload", "reach", "repeatability")}
+        repeatability = "-" if r.repeatability_m is None else f"{1e3 * r.repeatability_m:g}"
         table.add_row(
-            *(r.name, f"{r.flange}{mark['flange']}", f"{math.degrees(r.pin_angle_rad):.0f}"),
-            *(f"{r.payload_kg:g}{mark['payload']}", f"{r.reach_m:g}{mark['reach']}"),
-            *(f"{1e3 * r.repeatability_m:g}{mark['repeatability']}", str(len(r.chain.joint_names)), str(r.inverse)),
+            *(r.name, r.flange, "-" if r.dowel_deg is None else f"{r.dowel_deg:g}", f"{r.payload_kg:g}"),
+            *(f"{r.reach_m:g}", repeatability, str(len(r.chain.joint_names)), r.inverse),
         )
     screen = Console()
     screen.print(table)
-    screen.print("? unconfirmed: from memory of the maker's data sheet; no public source was found.", highlight=False)
-    screen.print("weldcal robots NAME shows one robot, joint by joint, with its sources.", highlight=False)
+    screen.print("-: not in a public source. dowel: degrees about the tool's z, from x.", highlight=False)
+    screen.print(
+        "weldcal robots NAME shows one robot, joint by joint, with the source of each number.", highlight=False
+    )
 
 
 def _print_one(robot: Robot) -> None:
-    rows = {
-        "flange": f"{robot.flange}, dowel at {math.degrees(robot.pin_angle_rad):.0f} degrees",
+    values = {
+        "flange": robot.flange,
+        "dowel": "" if robot.dowel_deg is None else f"{robot.dowel_deg:g} degrees about the tool's z, from x",
         "payload": f"{robot.payload_kg:g} kg",
         "reach": f"{robot.reach_m:g} m",
-        "repeatability": f"± {1e3 * robot.repeatability_m:g} mm",
-        "inverse kinematics": str(robot.inverse),
-        "source": robot.source,
-        **{f"{what}, confirmed by": str(where) for what, where in robot.confirmed},
-        "unconfirmed": ", ".join(robot.unconfirmed),
+        "repeatability": "" if robot.repeatability_m is None else f"± {1e3 * robot.repeatability_m:g} mm",
+        "joint limits": f"{robot.joints} axes, below",
+        "kinematics": f"inverse: {robot.inverse}",
+        "TCP": robot.tcp,
+    }
+    rows = {
+        fact: f"{value} ({robot.sources[fact]})" if value else "not in a public source"
+        for fact, value in values.items()
     }
     chain = robot.chain
     limits = zip(chain.joint_names, chain.position_lower, chain.position_upper, chain.velocity_limit, strict=True)

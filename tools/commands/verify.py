@@ -17,7 +17,7 @@ from weldcal.calibration.eye_on_base.observations import corrected_observation, 
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.hand_eye.solve import as_transform
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document

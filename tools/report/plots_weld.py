@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
 from weldcal.tools.report.pictures import GREY, OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
-from weldcal.welding.locate.part.fit import into
 from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.planes import into
 
 _SMALL = 8
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark

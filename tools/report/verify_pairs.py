@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
-from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,

@@ -89,7 +89,8 @@ def arm_scenario(arm: str, seam_mm: float) -> str:
         kinematic_error_mm=KINEMATIC_ERROR_MM * get_robot(arm).reach_m / get_robot(REFERENCE).reach_m,
         x=scale * PART_X_M,
         z=SCANNER_Z_M + SCANNER_RISE_M * (scale - 1.0),
-        repeatability_mm=1e3 * get_robot(arm).repeatability_m,
+        # a choice where the maker's figure is not public: the UR20's 0.1 mm
+        repeatability_mm=1e3 * (get_robot(arm).repeatability_m or 1e-4),
         length=max(LEAST_SEAM_MM, min(scale, 1.0) * SEAM_MM),
         seam=seam_mm,
         home=", ".join(f"{angle:.1f}" for angle in np.rad2deg(home_of(arm))),

@@ -1,5 +1,7 @@
-"""Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers,
-transposition."""
+"""Enumerate the plausible readings of a list of poses.
+
+Notation of the rotation, unit and order of its numbers, transposition.
+"""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -113,8 +115,9 @@ def apply_change(X: Array, change: str) -> Array:
 
 
 def readings(numbers: PoseNumbers) -> list[PoseReading]:
-    """The readings of a list that its numbers and statements allow, the usual one first, without changes beyond the
-    stated ones.
+    """List the readings of a list that its numbers and statements allow, the usual one first.
+
+    There are no changes beyond the stated ones.
 
     Raises:
         DatasetError: no reading is possible, or a stated one contradicts the numbers.

@@ -1,5 +1,7 @@
-"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has
-them."""
+"""Read pose pairs.
+
+Npz, tables, documents and samples of other tools, with corners and joint angles where a file has them.
+"""
 
 import re
 from collections.abc import Mapping
@@ -33,11 +35,14 @@ LENGTHS = UNITS
 
 @dataclass(frozen=True, kw_only=True)
 class PosePairs:
-    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a
-    second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
-    published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how
-    each list was understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
+    """Pose pairs in metres.
+
+    ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a second robot or None,
+    ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the published answer where
+    there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where given (NaN: not seen).
+    ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how each list was understood;
+    ``notes``: sentences about it; ``ids``: names of the rows, or empty.
+    """
 
     source: str
     robot: Array
@@ -98,7 +103,7 @@ def read_pairs(
     if length is not None and length not in LENGTHS:
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
     try:
-        return _read(path, mounting, length, stated or StatedForms())
+        return _pairs(path, *_contents(path), mounting, length, stated or StatedForms())
     except (DatasetError, InconsistentPoses):
         raise
     except InputError as e:
@@ -113,11 +118,6 @@ def pairs_of_lists(
     """The pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
     mounting = None if mounting is None else mounting_name(mounting)
     return _pairs(Path(names), lists, {}, mounting, length, stated)
-
-
-def _read(path: Path, mounting: str | None, length: str | None, stated: StatedForms) -> PosePairs:
-    lists, raw = _contents(path)
-    return _pairs(path, lists, raw, mounting, length, stated)
 
 
 def _pairs(
@@ -185,10 +185,9 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         raw = raw if isinstance(raw, dict) else {}
         units = raw.get("units")
         lists = folder_lists(path)
-        if len(lists) == 1 and any(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")):
-            raise DatasetError(
-                _pictures(path, sum(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")))
-            )
+        pictures = sum(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*"))
+        if len(lists) == 1 and pictures:
+            raise DatasetError(_pictures(path, pictures))
         if not lists:
             raise DatasetError(_no_lists(path))
         return lists, {

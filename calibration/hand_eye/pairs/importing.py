@@ -1,5 +1,7 @@
-"""Import pairs of robot and camera poses: find the two lists, pair their rows, and let the data choose how they are
-read."""
+"""Import pairs of robot and camera poses.
+
+Find the two lists, pair their rows, and let the data choose how they are read.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -33,7 +33,6 @@ from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.apply import applied
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -245,6 +244,13 @@ def test_apply_corrects_a_cloud_and_maps_it_into_the_base(
     assert "--overwrite" in again.output
 
 
-def test_apply_refuses_the_base_for_a_scanner_on_the_arm(result: CalibrationResult) -> None:
-    with pytest.raises(InputError, match="X_BF X_FC"):
-        applied(replace(result, configuration="eye_in_hand"), np.zeros((3, 3)), base=True)
+def test_apply_corrects_a_scan_of_a_scanner_on_the_flange_and_refuses_the_base(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("schema: 1\nX_FC: {}\nscanner_correction: {scale: 1.01, gradient_per_m: [0.0, 0.0]}\n")
+    np.save(tmp_path / "scan.npy", np.full((40, 3), 0.5) + 0.01 * np.arange(120).reshape(40, 3))
+    call = ["apply", str(file), str(tmp_path / "scan.npy"), str(tmp_path / "to.npy")]
+    assert CliRunner().invoke(app, call).exit_code == 0
+    assert np.load(tmp_path / "to.npy") == pytest.approx(1.01 * np.load(tmp_path / "scan.npy"))
+    refused = CliRunner().invoke(app, [*call, "--base", "--overwrite"])
+    assert refused.exit_code == 1
+    assert "scanner on the flange (X_FC)" in refused.output

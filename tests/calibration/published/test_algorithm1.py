@@ -22,7 +22,6 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
     translation_and_rotation_cost,
     translation_cost,
-    work_radius_cost,
 )
 from weldcal.models.errors import InputError
 
@@ -143,7 +142,7 @@ def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None
 def test_a_scenario_names_its_cost_and_the_axes_that_matter() -> None:
     error = np.array([0.001, 0.0, 0.002, 3e-4, 4e-4, 12e-4])
     assert named_cost("translation")(error) == pytest.approx(np.linalg.norm(error[3:]))
-    assert named_cost("work_radius", 0.2)(error) == pytest.approx(work_radius_cost(0.2)(error))
+    assert named_cost("work_radius", 0.2)(error) == pytest.approx(axes_cost((0, 1, 2, 3, 4, 5), 0.2)(error))
     # section 4.2: pick and place with an end-effector that gives way along z
     assert named_cost("work_radius", 0.2, ("x", "y"))(error) == pytest.approx(5e-4)
     assert named_cost("work_radius", 0.5, ("yaw",))(error) == pytest.approx(1e-3)

@@ -11,18 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
+from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, full_problem, linearise
-from weldcal.calibration.hand_eye.solve import (
-    HandEyeConfig,
-    as_transform,
-    pose_difference,
-    solve_axb_ycz,
-    solve_problem,
-)
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, pose_difference, solve_axb_ycz, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress

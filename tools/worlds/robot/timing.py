@@ -107,13 +107,17 @@ class HostLateness:
         )
 
     def caused(self, jobs: Sequence[Lateness]) -> int:
-        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in
-        time either."""
+        """Count the velocities of these jobs that were over 8 ms late by this computer's own doing.
+
+        The program above all others was not woken up in time either.
+        """
         return sum(job.shared_with(self.lateness, 8.0) for job in jobs)
 
     def judged(self, jobs: Sequence[Lateness]) -> str:
-        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the
-        cause."""
+        """State how many velocities of these jobs were over 8 ms late.
+
+        And for how many this computer itself was the cause.
+        """
         late, all_of = sum(job.over(8.0) for job in jobs), sum(sum(job.counts) for job in jobs)
         return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 
