@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
@@ -102,17 +103,23 @@ class CalibrationResult:
         """Name of the pose: X_BC, or X_FC of a scanner on the flange."""
         return "X_BC" if self.configuration == ON_BASE else "X_FC"
 
-    def correct(self, points_C: Array) -> Array:
-        """Correct measured points (..., 3) m of the camera frame for the scanner's own errors.
+    def correct(self, points_C: ArrayLike) -> Array:
+        """Correct measured points of the camera frame for the scanner's own errors, as the pose expects them.
 
-        The pose expects points that are corrected so.
+        Args:
+            points_C: (N, 3), or organised (H, W, 3), in metres; or a point cloud of Open3D.
 
         Returns:
-            The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays
-            NaN.
+            The corrected points, m, in the same shape; the same points where the result has no `scanner_correction`.
+            NaN stays NaN.
+
+        Raises:
+            InputError: not three coordinates for each point.
         """
         correction = correction_from_document(self.scanner_correction)
-        points = np.asarray(points_C, dtype=float)
+        points = np.asarray(getattr(points_C, "points", points_C), dtype=float)
+        if points.ndim < 1 or points.shape[-1] != 3:
+            raise InputError(f"Points must be (N, 3) or (H, W, 3) in metres; these are {points.shape}.")
         return points if correction is None else correction.points(points)
 
 

@@ -51,7 +51,8 @@ class Sources:
 
     def needed(self, module: str) -> set[str]:
         """The modules that a module imports, at its top or inside a function."""
-        names = [name for dotted in imported(self.trees[self.modules[module]]) for name in (dotted, _parent(dotted))]
+        dotted = imported(self.trees[self.modules[module]])
+        names = {name if name in self.modules else _parent(name) for name in dotted}
         return {name for name in names if name in self.modules} - {module}
 
     @cached_property

@@ -154,7 +154,14 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
             told("build the cell", 0.0)
             live = None if meshcat is None else LiveView() if source is None else source.live
             cell = build_cell(
-                scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, operator=operator, live=live
+                scenario,
+                options.seed,
+                meshcat,
+                robot.prepared,
+                open_sink=open_sink,
+                operator=operator,
+                live=live,
+                replace=options.replace,
             )
             with closing(cell.station):
                 if meshcat is not None:

@@ -108,7 +108,10 @@ class AddedMotion(AddedJob):
 
     def drift(self, root: Context) -> DriftStatus:
         """What the monitor has found so far."""
-        return DriftStatus() if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
+        if self.monitor is None:
+            return DriftStatus()
+        status: DriftStatus = self.value(self.monitor.GetOutputPort("drift"), root)
+        return status
 
     def counts(self, root: Context) -> tuple[int, int]:
         """Frames that were taken from the queue, and frames that were dropped."""

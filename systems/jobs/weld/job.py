@@ -163,11 +163,15 @@ class WeldJob(AddedJob):
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
-        return self.calibrator.status(self.calibrator.GetMyContextFromRoot(root))
+        status: CalibrationStatus = self.value(self.calibrator.GetOutputPort("calibration_status"), root)
+        return status
 
     def drift(self, root: Context) -> DriftStatus | None:
         """What the drift watch has found; None where the scanner does not stream."""
-        return None if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
+        if self.monitor is None:
+            return None
+        status: DriftStatus = self.value(self.monitor.GetOutputPort("drift"), root)
+        return status
 
     def planned_seam(self, root: Context) -> PlannedSeam:
         """The seam planner's newest plan; empty in a job that does not weld."""

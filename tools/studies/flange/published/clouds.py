@@ -18,6 +18,7 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     Algorithm1State,
+    Method,
     Verification,
     algorithm1_start,
     algorithm1_step,
@@ -26,7 +27,6 @@ from weldcal.calibration.published.algorithm1 import (
     sight,
 )
 from weldcal.calibration.published.pipeline import (
-    Method,
     PublishedVerification,
     all_pairs,
     at_flange,
