@@ -61,7 +61,7 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> Executed:
             capture_output=True,
             text=True,
             check=False,
-            timeout=500,
+            timeout=900,  # a busy computer
         )
         assert finished.returncode == 0, finished.stderr[-2000:]
         return folder, finished.stdout
