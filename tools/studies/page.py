@@ -14,7 +14,7 @@ from weldcal.tools.studies.harness import TABLE, markdown_table
 PAGE = "BENCHMARK.md"
 HEAD = """# Measured figures
 
-`weldcal dev benchmark page` wrote this page from the results of the studies. Each section has the command that measured it.
+`weldcal dev benchmark page` wrote this page from the results of the studies. Each section has its command.
 The sizes (`--runs`, `--quick` and similar) are in that command. A larger size gives narrower figures. Times are of the
 machine that ran it.
 
