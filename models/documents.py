@@ -87,7 +87,7 @@ _Loader.add_multi_constructor("", _tagged)
 
 
 class _Twice(Exception):
-    """A key that stands twice in a mapping."""
+    """Name a key that is twice in a mapping."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -166,7 +166,7 @@ class DocumentSection:
         return DocumentSection(file, value, place)
 
     def has(self, key: str) -> bool:
-        """Whether the key stands there with a value."""
+        """Return whether the key is there with a value."""
         return self.values.get(key) is not None
 
     def section(self, key: str) -> "DocumentSection":

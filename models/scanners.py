@@ -339,8 +339,10 @@ def is_scanner_file(name: str) -> bool:
 
 
 def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
-    """The named scanner, or that of a file (.yaml), resized when a width (and height) is given; raises InputError
-    naming the known ones, or what is wrong in the file."""
+    """Return the named scanner, or that of a file (.yaml), resized when a width (and height) is given.
+
+    Raises InputError that names the known scanners, or what is wrong in the file.
+    """
     if is_scanner_file(name):
         preset: ScannerPreset | None = ScannerPreset(**vars(read_scanner_file(Path(name))))
     else:

@@ -29,7 +29,7 @@ class BackgroundFailed(WeldcalError):
 
 @dataclass(frozen=True, eq=False)
 class Answer(Message, Generic[Found]):
-    """A computation under way: a system keeps it in its state and looks at each of its updates whether it is ready."""
+    """Hold a running computation: a system has it in its state and checks at each update whether it is ready."""
 
     future: "Future[Found]"
 

@@ -235,7 +235,7 @@ def load_result(path: Path) -> CalibrationResult:
     document = read_document(path)
     if isinstance(document, dict) and "X_FC" in document:
         raise InputError(
-            f"'{path}' is of a scanner on the flange (X_FC); a scanner that stands beside the robot is needed here."
+            f"'{path}' is the calibration of a scanner on the flange (X_FC). Give one of a scanner beside the robot."
         )
     if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")

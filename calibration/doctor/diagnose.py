@@ -42,7 +42,7 @@ _NOISE_CHANCE = 1e-5  # a choice: ten false alarms in a million data sets; a fac
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Another way to read the poses: the cause's name, what it is in words, the case so read and its fit."""
+    """Hold another reading of the poses: the cause's name, its description, the case in that reading and its fit."""
 
     cause: str
     words: str
@@ -488,7 +488,7 @@ def _weight(winner: Explained, models: list[Explained], null: CauseFit) -> float
 
 
 def _residuals(null: CauseFit, best: CauseFit) -> dict[str, float]:
-    """Medians of centres (mm) and, where normals were seen, of their angles (deg), without and with the cause."""
+    """Return medians of centres (mm) and, given normals, of their angles (deg), without and with the cause."""
     out = {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
     if np.isfinite(null.tilt).any() and np.isfinite(best.tilt).any():
         out |= {

@@ -103,7 +103,7 @@ def tcp(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def _faces_straight(case: DoctorCase, found: CauseFit) -> DoctorCase | None:
-    """The case with the poses turned so that the faces seen look along z.
+    """Return the case with the poses turned so that the scanned faces look along z.
 
     None where they do, or no normals were seen.
     """

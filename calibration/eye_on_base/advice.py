@@ -94,7 +94,7 @@ def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
 
 
 def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
-    """Standard deviation (3-D, m) of a scanned point that is seen at ``p_BQ`` (3,) m."""
+    """Return the standard deviation (3-D, m) of a scanned point at ``p_BQ`` (3,) m."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BQ))))
 
 

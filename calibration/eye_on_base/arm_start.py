@@ -1,4 +1,4 @@
-"""Finds roughly where the scanner stands from the visible arm.
+"""Estimate the scanner's approximate pose from the visible arm.
 
 Its capsules at the recorded joints against one scan or more.
 """
@@ -462,7 +462,7 @@ def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
 
 
 def _verdict(X: Array, views: Sequence[_View], allowance: float) -> tuple[float, float]:
-    """Mean shares over the scans: points on the arm, and surface seen through."""
+    """Return mean shares over the scans: points on the arm, and arm surface that the scanner looks through."""
     on, through = [], []
     for view in views:
         d = capsule_distance(view.points @ X[:3, :3].T + X[:3, 3], view.shape)[0]

@@ -59,7 +59,7 @@ class CalibrationEstimate:
 
 
 def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
-    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m.
+    """Return the covariance (3, 3) m^2, in B, of the base position of a scanned point at ``p_BQ`` (3,) m.
 
     With a scanner correction, X_BC and correction err together: where both were seen, much of either cancels.
     """

@@ -140,7 +140,7 @@ def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, see
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:
-    """Where to look in this cloud, where the dataset or a calibration says roughly where the scanner stands."""
+    """Return where to look in this cloud, if the dataset or a calibration gives the scanner's approximate pose."""
     X_CR, reach = data.guess(id), _SEARCH_M
     if X_CR is not None and data.header.scanner_guess is not None:
         reach = data.header.scanner_guess.radius_m

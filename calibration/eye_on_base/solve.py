@@ -58,7 +58,7 @@ class SolveConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """Observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) normal seen; fit noise."""
+    """Hold observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) a normal; fit noise."""
 
     b: Array
     c: Array
@@ -87,7 +87,7 @@ class _Solution:
 def estimate_eye_on_base(
     observations: list[Observation] | tuple[Observation, ...], config: SolveConfig | None = None
 ) -> CalibrationEstimate:
-    """Estimate X_BC from observations of the flange at n poses; positions and (where seen) normals are used together.
+    """Estimate X_BC from observations of the flange at n poses, from positions and (if any) normals together.
 
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
     of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
@@ -125,9 +125,9 @@ def estimate_eye_on_base(
     used = inliers & data.has
     if used.any() and float(np.median(tilt[used])) > _WORST_TILT_RAD:
         raise InconsistentPoses(
-            f"The faces seen are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from where the poses have"
-            " the flange's z axis: check the quaternion order (qw, qx, qy, qz) and that the poses are those of the"
-            " flange, not of a tool."
+            f"The scanned faces are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from the flange's z axis"
+            " in the poses. Check the quaternion order (qw, qx, qy, qz), and that the poses are those of the flange,"
+            " not of a tool."
         )
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
@@ -227,7 +227,7 @@ def _trimmed(square: Array, h: int) -> Array:
 
 
 def _distances(data: _Data, X: RigidTransform) -> Array:
-    """Of each centre seen from its stated place, (n,) m."""
+    """Return the distance of each observed centre from its stated position, (n,) m."""
     return np.asarray(np.linalg.norm(data.c @ X.rotation().matrix().T + X.translation() - data.b, axis=1))
 
 
@@ -296,7 +296,7 @@ def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
 
 
 def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0) -> _Solution:
-    """Weighted Gauss-Newton on the kept poses, variance components updated between steps."""
+    """Solve by weighted Gauss-Newton on the inliers, with variance components updated between steps."""
     d = data.pick(keep)
     rows = d.has
     R, p, N, N_p, redundancy_p, redundancy_n, var_p, var_n = _gauss_newton(

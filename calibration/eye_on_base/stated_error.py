@@ -91,8 +91,10 @@ def joint_terms(
 def observed_document(
     observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
 ) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
-    joints where known."""
+    """Return the poses that a calibration used, for CalibrationResult.observed.
+
+    They are the feature in the base, the observed centre and normal, and the joints where they are known.
+    """
     X = X_FR or RigidTransform()
     return {
         "feature_xyz": [float(v) for v in X.translation()],

@@ -25,7 +25,7 @@ def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -
 
 
 def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
-    """Angle (n,) rad between seen and stated face normals; NaN where no normal was seen."""
+    """Return the angle (n,) rad between observed and stated face normals; NaN where none was observed."""
     out = []
     for o in observations:
         if o.n_C is None:

@@ -43,7 +43,7 @@ class BaseCircleConfig:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A plane seen through the pixels of a window (h, w, 3): heights (h, w) m over it, its axes, thickness."""
+    """Hold a plane under the pixels of a window (h, w, 3): heights (h, w) m over it, its axes, thickness."""
 
     plane: PlaneFit
     axes: Array
@@ -256,7 +256,7 @@ def _refine(
     rim = on_face & (circle.radius - rho < 1.5 * pitch)
     seen = coverage(xy[band][rim], circle.center)
     if seen < config.min_arc:
-        raise FlangeNotFound(f"Only {100 * seen:.0f} % of the base circle's edge was seen.")
+        raise FlangeNotFound(f"Only {100 * seen:.0f} % of the base circle's edge is in the scan.")
     axes, plane = view.axes, view.plane
     along = plane.rms**2 / plane.n_inliers + (plane.normal_sigma * float(np.linalg.norm(circle.center))) ** 2
     return FlangeFit(

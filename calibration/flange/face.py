@@ -128,7 +128,7 @@ class FaceRefusal:
 
 @dataclass(frozen=True)
 class FlangeFace:
-    """A flange face with its plane, its edges, the share of the outer edge seen, and its quality.
+    """Hold a flange face with its plane, its edges, the visible share of the outer edge, and its quality.
 
     The edges' centres (2,) are in the plane's axes.
     """

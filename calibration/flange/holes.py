@@ -56,7 +56,7 @@ class HolePattern:
 
 
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
-    """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are seen well.
+    """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are clear.
 
     ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face and
     have rims: slots are as empty as holes. Each hole's rim is a circle, with one radius for all threads in the end, and

@@ -167,7 +167,7 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
     for r, way in zip(radii, (inward, ~inward), strict=True):
         at = np.flatnonzero((np.abs(rho - r) < width) & way)
         if len(at) < 48:
-            raise CircleFitError("Too little of an edge was seen.")
+            raise CircleFitError("Too little of an edge is in the scan.")
         rims.append(d[:, at[:: -(-len(at) // _EDGE_POINTS)]].T)
     rough = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.05 * pitch)
     if (

@@ -211,7 +211,7 @@ def _edges(
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
         if len(rims[0]) < 24:
-            raise CircleFitError(f"Too little of an edge {1e3 * standard.outer_m:.0f} mm across was seen.")
+            raise CircleFitError(f"Too little of an edge {1e3 * standard.outer_m:.0f} mm across is in the scan.")
         seen = 1 + (len(rims[1]) >= 24)
         fits = refine_circles(rims[:seen], radii[:seen], noise_floor=0.1 * pitch)
         if not float(np.hypot(*fits[0].center)) < 3.0 * widths[0] or not 0.5 * radius < fits[0].radius < 2.0 * radius:
@@ -420,7 +420,7 @@ def _thin(ring: Mask) -> tuple[slice, slice]:
 
 
 def _honest(plane: PlaneFit, w: _Window, ring: Mask) -> PlaneFit:
-    """The plane with the spread that is left when neighbouring pixels share their noise: as some of them tell it."""
+    """Return the plane with its spread when neighbouring pixels share their noise, from a sample of pixels."""
     s = _thin(ring)
     n = plane.normal
     at = np.flatnonzero(ring[s])

@@ -157,7 +157,7 @@ def solve_ax_yb(
     covariance: ArrayLike | None = None,
     labels: dict[str, str] | None = None,
 ) -> HandEyeResult:
-    """A_i X = Y B_i for poses (n, 4, 4); B_i is what was measured, and residuals are seen in the child frame of B.
+    """Solve A_i X = Y B_i for poses (n, 4, 4); B_i is measured, and residuals are in the child frame of B.
 
     With the paper's Eq. (4): A = X_BF, B = X_CM, X = X_FM, Y = X_BC. ``covariance`` (n, 6, 6) of B in its child's
     tangent, beyond which the noise is estimated. Raises as solve_problem.

@@ -328,7 +328,7 @@ def _fitted(
 
 
 def _target(motion: ContinuousMotion) -> tuple[int, ...]:
-    """The unknowns of a fixed target, where one is seen."""
+    """Hold the unknowns of a fixed target, where there is one."""
     return TARGET if motion.inverted else ()
 
 

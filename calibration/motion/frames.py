@@ -53,7 +53,7 @@ class FittedFrames:
 
 
 def observed_frames(frames: list[FrameTime], fits: dict[str, FlangeFit]) -> ObservedFrames:
-    """Times and fits of frames as arrays; a rough face seen at a slant counts less along the slant."""
+    """Return times and fits of frames as arrays; a rough face at a slant has less weight along the slant."""
     device = np.array([np.nan if f.device is None else f.device for f in frames])
     found = [fits[f.id] for f in frames]
     return ObservedFrames(

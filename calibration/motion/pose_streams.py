@@ -159,8 +159,8 @@ def synchronise_lists(
     if len(a) * len(b) > _MOST_READINGS:
         who = "robot" if len(a) >= len(b) else "camera"
         raise DatasetError(
-            f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))}"
-            f" ways. State how they are written, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
+            f"The rotations of '{(robot if who == 'robot' else camera).name}' fit {max(len(a), len(b))}"
+            f" conventions. Name the right one, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
         )
     tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None

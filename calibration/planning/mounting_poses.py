@@ -130,7 +130,7 @@ def _way(
 
 
 def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
-    """Return the first n poses with a free way from home.
+    """Return the first n poses with a free path from home.
 
     The way home is the same backwards. Each pose is reached from the one before it where that is free too.
     """

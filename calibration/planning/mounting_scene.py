@@ -160,7 +160,7 @@ class MountingScene:
     def observation(
         self, q: Array, q_2: Array | None, p_CR: Array, n_CR: Array, covariance: Array | None = None
     ) -> TargetObservation:
-        """A circle seen with the arms at q and q_2, as the solver takes it."""
+        """Return the observation of a circle with the arms at q and q_2, as the solver takes it."""
         frames = self.frames(q)
         X_DE = None if self.arm_2 is None or q_2 is None else link_frames(self.arm_2, q_2)[FLANGE]
         X_BL = frames[self.link] if "arm" in self.configuration else None
@@ -218,7 +218,7 @@ class Bodies:
         return min(low)
 
     def hidden(self, frames: list[RigidTransform], frames_2: list[RigidTransform] | None, X_BR: RigidTransform) -> bool:
-        """Whether a body stands between the scanner and the circle (of a base circle: the half that is on its side)."""
+        """Return whether a body is between scanner and circle (of a base circle: the half that is on its side)."""
         eye = np.asarray((frames[self.scene.link] @ self.scene.X_LC).translation())
         ring = self.scene.radius_m * np.column_stack([np.cos(_RING), np.sin(_RING), 0.0 * _RING])
         points = (X_BR @ ring.T).T

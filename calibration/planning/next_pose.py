@@ -49,7 +49,7 @@ class VisibleVolume:
 
 
 def tilt(G: Array) -> Array:
-    """Angles (n,) rad between the z axis of targets (n, 4, 4), whichever way it points, and the line of sight."""
+    """Return angles (n,) rad between the z axis of targets (n, 4, 4), of either sign, and the line of sight."""
     p = G[:, :3, 3]
     ray = p / np.maximum(np.linalg.norm(p, axis=1), 1e-12)[:, None]
     return np.asarray(np.arccos(np.clip(np.abs((ray * G[:, :3, 2]).sum(axis=1)), 0.0, 1.0)))

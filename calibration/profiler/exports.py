@@ -231,7 +231,7 @@ def _numbered(scan: Floats) -> np.ndarray[Any, Any]:
 
 
 def _runs(poses: Floats) -> np.ndarray[Any, Any]:
-    """The number of each row's profile where no column tells it.
+    """Return the number of each row's profile where no column has it.
 
     Rows that follow each other with one pose, else each row.
     """

@@ -59,7 +59,7 @@ def plan_edge_poses(
     sigma_xz_m: ArrayLike,
     field: Field | None = None,
 ) -> PosePlan:
-    """Choose candidates to add to an edge's scans; those from which the edge is not seen in the field are excluded.
+    """Choose candidates to add to an edge's scans; those without the edge in the field are excluded.
 
     Raises:
         InputError: no candidate sees the edge, or fewer than asked for.

@@ -140,7 +140,7 @@ class VerificationError:
 
     @property
     def components(self) -> tuple[tuple[str, float, bool], ...]:
-        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre.
+        """Return (name, value in rad or m, whether it is observable) of each degree of freedom, at the flange centre.
 
         NaN where it could not.
         """

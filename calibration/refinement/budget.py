@@ -57,7 +57,7 @@ class ErrorBudget:
 
     @property
     def next(self) -> Contribution:
-        """The source whose remedy reduces the total most."""
+        """Return the source whose correction reduces the total most."""
         return max(self.rows, key=lambda r: (1.0 - r.left**2) * r.mm**2)
 
     @property

@@ -191,9 +191,9 @@ def choose_kinematics(
     turned = turn_deg([o.X_BR for o in observations])
     if turned < LEAST_TURN_DEG:
         raise InputError(
-            f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told"
-            f" from the scanner's; turn and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine"
-            " local."
+            f"The orientation of the flange varies by {turned:.1f} degrees only. Errors of the arm (--refine {kind})"
+            f" cannot then be separated from errors of the scanner. Turn and tilt the flange by {LEAST_TURN_DEG:.0f}"
+            " degrees or more, or use --refine local."
         )
     factory = arm_errors(arm, kind)
     none = replace(factory, which=factory.which[:0], scale=factory.scale[:0], names=())

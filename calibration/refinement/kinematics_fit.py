@@ -86,7 +86,7 @@ def unsought(arm: Chain, kind: str) -> ArmErrors | None:
 
 
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
-    """Return the errors of the arm that a scanner beside it can tell from its own pose.
+    """Return the errors of the arm that a scanner beside it can separate from its own pose.
 
     ``kind`` is "joints" for joint offsets, or "links" for all errors of the links.
 
@@ -304,7 +304,7 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
 
 
 def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
-    """Return position residuals (3 n) m, then those of the seen normals (3 n) rad, in the base.
+    """Return position residuals (3 n) m, then those of the observed normals (3 n) rad, in the base.
 
     The latter lie beside the normals of the reached poses X (n, 4, 4).
     """

@@ -190,7 +190,7 @@ def _as_grid(points: Array, columns: int, rows: int) -> Array | None:
 
 
 def _turned(grid: Array, columns: int, rows: int) -> list[Array]:
-    """The grid (n, 2) row by row from each corner that it can start from; a page is never seen from behind."""
+    """Return the grid (n, 2) row by row from each corner at which it can start; a page always shows its front."""
     square = grid.reshape(rows, columns, 2)
     right, down = square[0, -1] - square[0, 0], square[-1, 0] - square[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:

@@ -36,7 +36,7 @@ _LEAST_READINGS = (
 
 @dataclass(frozen=True)
 class Queries:
-    """Points of the tablet that were seen but not used.
+    """Hold points of the tablet that are in the images but not used.
 
     Pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches them.
     """

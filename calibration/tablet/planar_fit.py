@@ -49,7 +49,7 @@ class LinearFit:
     condition: float
 
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
-        """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
+        """Return hand positions (m, 2) m from which the pen touches the points on rays (m, 2), at turns (m,) rad."""
         return np.asarray((_design(rays.T, theta_rad) @ self.parameters).T)
 
 
@@ -162,7 +162,7 @@ class PlanarFit:
     free_scale: tuple[float, float]
 
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
-        """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
+        """Return hand positions (m, 2) m from which the pen touches the points on rays (m, 2), at turns (m,) rad."""
         return hand_over(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
 
 

@@ -325,7 +325,7 @@ def hand_to_touch(
     theta_rad: Array,
     model: Model = "htm",
 ) -> Array:
-    """Return hand positions (m, 2) m from which the pen touches what is seen at ``uv_px`` (m, 2).
+    """Return hand positions (m, 2) m from which the pen touches the points at ``uv_px`` (m, 2).
 
     By Eq. 8, or by Eq. 25 with an affine pair (10,).
 

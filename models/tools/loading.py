@@ -89,7 +89,7 @@ class TagPart:
 
 @dataclass(kw_only=True)
 class ShapePart:
-    """A body of the tool: drawn, seen by the scanner, and kept clear of the table and of the line of sight.
+    """Describe a body of the tool: drawn, visible to the scanner, clear of the table and of the line of sight.
 
     One kind of a shape.
     """
@@ -265,8 +265,8 @@ def check_sight(loaded: LoadedTool) -> Array:
         )
     if facing < np.cos(np.deg2rad(60.0)):
         raise InputError(
-            f"'{file}': the tag does not face the finger camera: its z must point back at it, and it stands "
-            f"{np.rad2deg(np.arccos(np.clip(facing, -1.0, 1.0))):.0f} deg away; check tag.rpy_deg."
+            f"'{file}': the tag does not face the finger camera. The tag's z axis must point at the camera, and it is "
+            f"{np.rad2deg(np.arccos(np.clip(facing, -1.0, 1.0))):.0f} deg off: correct tag.rpy_deg."
         )
     half = 0.5 * tool.tag_size_m * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     p_K = half @ X_KM.rotation().matrix().T + X_KM.translation()

@@ -381,7 +381,7 @@ def unit(v: Floats) -> Floats:
 
 
 def _end_of(face: SolidFace, edge: Any) -> tuple[Floats, Floats, Floats] | None:
-    """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
+    """Return an edge's middle, the face's normal there, and the direction out of the face in its plane."""
     curve = BRepAdaptor_Curve(edge)
     straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
     if BRep_Tool.Degenerated_s(edge) or not (

@@ -154,8 +154,8 @@ def _fitted(mesh: TriMesh, points: Floats, t: Floats, ups: Floats | None, joint:
     if (trimmed > _TRIMMED_M or holes > 0.1 * n * SPACING_M + 2e-3) and not (closed and trimmed <= holes):
         at_mm = 1e3 * SPACING_M * int(np.argmin(good))
         raise InputError(
-            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam (the first at {at_mm:.1f} mm) the part has no"
-            f" {joint} joint within {1e3 * FARTHEST_M:.0f} mm of the line: check the line, its unit and the joint."
+            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam, first at {at_mm:.1f} mm, the part has no"
+            f" {joint} joint within {1e3 * FARTHEST_M:.0f} mm of the line. Check the line, its unit and the joint."
         )
     keep = slice(first, last + 1)
     s = np.arange(n)[keep]

@@ -143,8 +143,8 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     mesh, body = _bodies(read_surface(path, unit_m))
     if not mesh.watertight():
         raise InputError(
-            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a"
-            " solid."
+            f"'{path.name}' is not a closed surface: it has a hole, or some triangles face inward and others outward."
+            " Repair it to a closed solid."
         )
     if mesh.volume < 0.0:
         mesh = mesh.flipped()

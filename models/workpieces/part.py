@@ -158,7 +158,7 @@ class WeldPart(Protocol):
         """Where the centre of the loaded tip rests, from the root."""
 
     def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
-        """How hard the tip is pressed; a value that is given is kept."""
+        """Return how deep the tip is pressed; a given value is used as it is."""
 
     def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the joint in which it then rests."""

@@ -125,7 +125,7 @@ class DrawnSeam:
         )
 
     def reversed(self) -> DrawnSeam:
-        """The same seam travelled the other way: left and right change places."""
+        """Return the same seam in the opposite direction: left and right change places."""
         return replace(
             self,
             points_P=self.points_P[::-1],

@@ -130,8 +130,8 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
         sinks = r - math.sqrt(r**2 - 0.25 * section.gap_m**2)
         if min(section.left_m, section.right_m) < sinks + MARGIN_M:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm stands on the ground: the plates are thinner than the"
-                f" {mm * sinks:.2g} mm that it sinks into a gap of {mm * section.gap_m:.3g} mm."
+                f"A tip of radius {mm * r:.3g} mm sinks {mm * sinks:.2g} mm into a gap of {mm * section.gap_m:.3g} mm"
+                " and touches the ground, because the plates are thinner. Use a larger tip or a narrower gap."
             )
     elif section.half_angle_rad > 0.5 * math.radians(176.0):
         raise JointNotWeldable("The plates meet without a gap: there is nothing the tip could feel; leave a gap.")
@@ -161,7 +161,7 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
 def press_for(
     section: JointSection, tip: SeatedTip, axial_m: float | None = None, lateral_m: float | None = None
 ) -> Press:
-    """How hard the tip is pressed into this joint, m; a value that is given is kept.
+    """Return how deep the tip is pressed into this joint, m; a given value is used as it is.
 
     Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall; half of that is
     taken, at most 2 mm, and in wide joints the downward press is increased.
@@ -187,7 +187,7 @@ def press_for(
         )
     if lateral < LEAST_LEAN_M:
         raise JointNotWeldable(
-            f"The tip could lean only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out, which"
+            f"The tip can press only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out. That"
             " is too little to be felt: use a smaller tip or a wider gap."
         )
     return Press(axial, lateral)

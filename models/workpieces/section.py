@@ -41,7 +41,7 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The free space between two walls, seen from one point of a cut.
+    """Describe the free space between two walls, from one point of a cut.
 
     Angles from x towards y, rad, and the walls' normals.
     """

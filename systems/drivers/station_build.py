@@ -52,7 +52,7 @@ class PreparedRobot:
         return None if self.clock is None else self.clock.pace
 
     def rest(self) -> None:
-        """Keep the arm at rest while the Diagram stands, with the handle's `rest` where it has one."""
+        """Keep the arm at rest while the Diagram is paused, with the handle's `rest` where it has one."""
         if (rest := getattr(self.handle, "rest", None)) is not None:
             rest()
 

@@ -32,7 +32,7 @@ MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 @dataclass(eq=False, kw_only=True)
 class AddedJob(ABC):
-    """A job's systems in a cell, as seen by the run loop, the reports and the tests."""
+    """Give the run loop, the reports and the tests access to a job's systems in a cell."""
 
     ports: JobPorts
     maximum_time_s: float  # the job holds itself after this time

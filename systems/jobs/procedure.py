@@ -268,7 +268,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return self.enter(s, now, phase, trigger=s.trigger + 1, **changes)
 
     def end(self, s: StateOf, now: InputsOf) -> StateOf:
-        """The state at the end: held where a reason was found on the way, else done."""
+        """Return the state at the end: held where a reason was found during the procedure, else done."""
         return self.enter(s, now, "held" if s.reason else "done")
 
     def held(self, s: StateOf, now: InputsOf, reason: str) -> StateOf:

@@ -51,7 +51,7 @@ _PLACES = 40  # remembered: a browser answers late
 
 
 class CameraPlace(NamedTuple):
-    """From `time` s on camera `view` stands at `eye` and looks at `target`, (3,) m in the world."""
+    """Place camera `view` at `eye`, looking at `target`, (3,) m in the world, from `time` s on."""
 
     time: float
     view: str

@@ -141,7 +141,7 @@ class CellVisualizer(LeafSystem):
         self._meshcat.SetTransform(path, RigidTransform(R_SIGN, p_B))
 
     def _beside(self, X_BC: RigidTransform, up_m: float) -> Array:
-        """Where the sign of a camera stands: beside its axes, off the housing."""
+        """Return where the sign of a camera is: beside its axes, off the housing."""
         return np.asarray(X_BC.translation() + np.array([0.0, 0.0, up_m]))
 
     def _show(self, path: str, time: float) -> None:

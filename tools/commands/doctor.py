@@ -76,8 +76,8 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():
         raise InputError(
-            f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the"
-            " dataset's folder."
+            f"'{folder}' is a result of an older version, without the flange of each scan. Calibrate again, or give"
+            " the dataset's folder."
         )
     return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
 

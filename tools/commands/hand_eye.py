@@ -363,7 +363,7 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Cloc
 
 
 def _solved_pictures(shots: PictureSet, config: HandEyeConfig) -> tuple[HandEyeResult, PosePairs, PictureResult]:
-    """The result of pictures; which of them are not used is said by their names."""
+    """Return the result of pictures, with the names of those that are not used."""
     result, pairs, pictures = solve_pictures(shots, lambda pairs: solve_pairs(pairs, config))
     left = [f"{p.name} ({p.why[0].lower()}{p.why[1:].rstrip('.')})" for p in pictures.pictures if p.why]
     warnings = [w for w in result.warnings if "were excluded:" not in w]

@@ -254,7 +254,7 @@ def recorded_report(
     started: float | None = None,
     **more: Any,
 ) -> RecordedMounting:
-    """The report of the circles that were seen at known joint angles, with held-out errors of five folds."""
+    """Write the report of the circles at known joint angles, with held-out errors of five folds."""
     result = solve_mounting(scene, seen, folds=5)
     sigma, within = expected_error(scene, result)
     status = MountingStatus(

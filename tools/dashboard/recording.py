@@ -31,7 +31,7 @@ def with_overlay(html: str, run: Run[Any], live: LiveView, title: str) -> str:
 
 
 def _told(cell: Cell[Any], run: Run[Any], live: LiveView, title: str) -> dict[str, Any]:
-    """What the overlay tells at each time of the recording."""
+    """Return the overlay's text at each time of the recording."""
     facts = facts_of(cell, title, "")
     weld = weld_rows(live.weld[:: max(1, len(live.weld) // _ROWS)])
     words = facts.required_mm == facts.required_mm and bool(facts.seconds)

@@ -72,7 +72,7 @@ def _key(task: str, arguments: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Farm:
-    """Where a study's tasks run and where their results are kept.
+    """Hold where a study's tasks run and where their results are stored.
 
     Attributes:
         folder: of the study's results; a second run with the same folder does only what is missing.

@@ -153,7 +153,7 @@ class CalibrationReport:
 
     @property
     def _remarks(self) -> list[str]:
-        """Those of the warnings that tell what was done, not what could be wrong."""
+        """Return those of the warnings that report what was done, not what could be wrong."""
         applied = self.scanner is not None and self.scanner.accepted is not None
         return [*([self.scanner.sentence] if applied and self.scanner is not None else []), *self._refined]
 
@@ -303,7 +303,7 @@ def feature_table(fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePatt
 
 
 def fit_cells(fit: FlangeFit | None) -> tuple[str, str]:
-    """One sigma of the centre (3-D, mm) and the share of the edge seen (%); dashes without a fit."""
+    """Return one sigma of the centre (3-D, mm) and the visible share of the edge (%); dashes without a fit."""
     if fit is None:
         return "–", "–"
     return fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3), fixed(100 * fit.coverage, 0)

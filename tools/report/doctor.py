@@ -88,7 +88,7 @@ _NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "
 
 
 def name_cause(problem: WeldcalError, case: DoctorCase) -> None:
-    """Add the likely cause, its evidence and its remedy to the sentence of a refusal, unless the sentence names it."""
+    """Add the likely cause, its evidence and its correction to a refusal, unless the refusal names it."""
     causes = worded("", diagnose(case), most=1).causes
     if not causes or causes[0].name in _NAMED_ALREADY:
         return

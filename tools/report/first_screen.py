@@ -273,7 +273,7 @@ class FirstScreen:
 
     @property
     def nothing(self) -> str:
-        """What is said where there is no concern besides the verdict's reason."""
+        """Return the text for no concern besides the verdict's reason."""
         return "Nothing was found." if self.verdict == USE or not self.found.against else "Nothing else was found."
 
     def rows(self) -> dict[str, str]:

@@ -55,7 +55,7 @@ class HandEyeReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. Pose pairs have no work point: the held-out error at the target stands in its place."""
+        """Return the first screen. Pose pairs have no work point: the held-out error at the target takes its place."""
         r = self.result
         expected, p95, n = held_out_error(r)
         tolerance = limit_tolerance(expected.what, p95, self.limit_mm)

@@ -247,7 +247,7 @@ def _errors(
 
 
 def _offset(report: MonitorReport) -> bytes:
-    """By how much frames were later than their clock says, as their own residual tells it."""
+    """Return by how much frames were later than their clock says, by their own residual."""
     w = report.watched
     figure, axes = subplots(8.2, 2.5)
     t = w.rows.times

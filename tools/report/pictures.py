@@ -111,7 +111,7 @@ _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good s
 
 
 def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) -> bytes:
-    """Each scan's points (N, 3) m of C about its flange, seen along the found normal, with the found edges; PNG.
+    """Draw each scan's points (N, 3) m of C about its flange, along the found normal, with the found edges; PNG.
 
     Colours: height above the found face. The first MOST_SCANS scans are drawn.
     """

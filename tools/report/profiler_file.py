@@ -161,7 +161,7 @@ class ProfilerSeam:
 
 
 def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Sentences on scans that were not used: those that put the result in doubt, and the others."""
+    """Return sentences on scans that were not used: those that question the result, and the others."""
 
     def said(words: Mapping[str, str]) -> list[str]:
         return [text.format(n=len(found[key]), all=found["scans"]) for key, text in words.items() if found.get(key)]

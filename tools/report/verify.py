@@ -129,7 +129,7 @@ class VerifyReport:
 
     @property
     def tilt_deg(self) -> dict[str, float | None]:
-        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
+        """Return median and 95th percentile of the tilt, deg; None without a normal."""
         found = statistics(np.array([p.tilt_deg for p in self.poses], dtype=float))
         return {key: known(found[key]) for key in ("median", "p95")}
 

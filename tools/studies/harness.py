@@ -1,4 +1,4 @@
-"""Runs every study in one way: cases on workers, figures, targets with verdicts, tables, and the files of its result.
+"""Run every study alike: cases on workers, figures, targets with verdicts, tables, and the files of its result.
 
 A study is one frozen description in its own module, and the command that runs it:
 

@@ -377,7 +377,7 @@ def npy(content: bytes, rng: Rng) -> Damage:
 
 
 def _zip(members: dict[str, bytes], rng: Rng, again: str | None = None) -> bytes:
-    """A zip of the members; ``again``: one that stands there a second time, with another last byte."""
+    """Return a zip of the members; ``again``: one that is there a second time, with another last byte."""
     stream = io.BytesIO()
     method = zipfile.ZIP_DEFLATED if rng.random() < 0.5 else zipfile.ZIP_STORED
     with zipfile.ZipFile(stream, "w", method) as archive, warnings.catch_warnings():

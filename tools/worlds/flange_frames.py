@@ -194,7 +194,7 @@ def _surroundings(
     count: int,
     clear_of: RigidTransform | None,
 ) -> list[TriMesh]:
-    """A table and loose things, none of which stands between the scanner and the flange."""
+    """Return a table and loose things, none of which is between the scanner and the flange."""
     far = scanner.far_m
     while True:
         X_CT = RigidTransform(RollPitchYaw(*rng.uniform(-0.4, 0.4, 2), 0.0), [0.0, 0.0, rng.uniform(0.9, 1.15) * far])

@@ -188,7 +188,7 @@ class MistakenPairs:
 
 @dataclass(frozen=True)
 class SolverVerdict:
-    """What the solver said of a world.
+    """Hold the solver's answer on a world.
 
     "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or "NAN" and "WRONG", which must
     not be; ``nees``: of the answer, in units of the region that holds the truth.
@@ -231,7 +231,7 @@ def random_world(rng: np.random.Generator, mistake: str | None = None) -> Mistak
 
 
 def judge(world: MistakenPairs, config: HandEyeConfig | None = None) -> SolverVerdict:
-    """Solve a world as the command does and judge what it said against the truth."""
+    """Solve a world as the command does and judge the answer against the truth."""
     try:
         result = solve_pairs(world.pairs, config or HandEyeConfig(folds=0))
     except WeldcalError as e:

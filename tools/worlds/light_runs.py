@@ -120,7 +120,7 @@ def _simulated(scenario: Scenario) -> tuple[SimulatedUr, RenderedScanner]:
     robot, scanner = scenario.robot, scenario.scanner_config()
     if not isinstance(robot, SimulatedUr) or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
         raise InputError(
-            "This study needs a simulated arm and a scanner that stands in the base: give a scenario with robot:"
+            "This study needs a simulated arm and a scanner that is fixed in the base frame. Give a scenario with robot:"
             " !SimulatedUr and scanner: !RenderedScanner, such as s_groove."
         )
     return robot, scanner
@@ -276,7 +276,7 @@ class Redrawn:
 
 
 def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Array) -> Array:
-    """Joints (n, 6) rad in which a bare flange stands where each observation says.
+    """Return joints (n, 6) rad at which a bare flange is where each observation says.
 
     The solution nearest to ``q_home``.
     """
@@ -355,7 +355,7 @@ def _redrawn(o: Observation, q: Array, station: RedrawnStation, rng: np.random.G
 
 
 def _in_base(o: Observation) -> Array:
-    """The fit's covariance (3, 3) m^2: along the face's normal and across, whatever way the camera is turned."""
+    """Return the fit's covariance (3, 3) m^2: along the face's normal and across, for any orientation of the camera."""
     assert o.center_covariance is not None
     n = np.asarray(o.n_C) if o.n_C is not None else np.array([0.0, 0.0, -1.0])
     along = float(n @ o.center_covariance @ n)

@@ -69,7 +69,7 @@ class Disturbance:
     warm_up_gradient_per_m: float = 0.0
 
     def world_in_base(self, t: float) -> RigidTransform:
-        """Pose X_BW of what stands still, in the robot's base, at ``t`` s.
+        """Return the pose X_BW of the static surroundings, in the robot's base, at ``t`` s.
 
         The two are one before the base has moved.
         """
@@ -393,7 +393,7 @@ def facing(centre: Array, X_BC: RigidTransform) -> RotationMatrix:
 
 
 def surroundings(centre: Array) -> list[RigidBody]:
-    """The table and blocks on it in the scanner's view: by them a moved scanner is told from a moved robot."""
+    """Return the table and blocks in the scanner's view: they separate a moved scanner from a moved robot."""
     blocks = []
     for x, y, top in ((-0.16, 0.22, 0.24), (0.10, 0.24, 0.18), (0.16, -0.25, 0.22), (-0.10, -0.26, 0.14)):
         place = centre + np.array([x, y, 0.0])

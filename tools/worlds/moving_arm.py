@@ -209,7 +209,7 @@ _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base.
+    """Hold a rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None is fixed in the base.
 
     ``dark`` 0 to 1.
     """
@@ -365,7 +365,7 @@ class MovingScene:
         return out
 
     def _static(self, X_WC: RigidTransform) -> Depth:
-        """Depth (H, W) of what stands still, rendered again where the camera has moved."""
+        """Return the depth (H, W) of the static surroundings, rendered again where the camera has moved."""
         pose = X_WC.GetAsMatrix34()
         if self._background is not None and np.array_equal(self._background[0], pose):
             return self._background[1]

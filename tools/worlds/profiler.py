@@ -52,7 +52,7 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerCell:
-    """Where a world's arm stands.
+    """Hold the pose of a world's arm.
 
     Its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where the groove's and the
     frustum's frames lie, the groove turned about z.
@@ -385,7 +385,7 @@ def _perfect(width_m: float, samples: int) -> ProfilerPreset:
 def _seen(
     world: SphereWorld, mesh: TriMesh, turn: Floats, place: Floats, X: FlangePoses, preset: ProfilerPreset
 ) -> Floats:
-    """Profiles (n, m, 2) without noise, of a mesh that stands at X_BP = (turn, place)."""
+    """Return profiles (n, m, 2) without noise, of a mesh at X_BP = (turn, place)."""
     R = np.einsum("ji,njk->nik", turn, X.rotation @ world.rotation)
     o = (X.rotation @ world.translation + X.translation - place) @ turn
     return cast_profiles(make_scene(mesh), R, o, preset)

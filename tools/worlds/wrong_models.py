@@ -50,7 +50,7 @@ WORK_C = np.array([0.02, -0.05, 0.38])
 
 @cache
 def _splines(device: int, warp_m: float) -> Array:
-    """Coefficients of the cubic splines through the device's depth errors, with room for the border's continuation."""
+    """Return coefficients of the cubic splines through the device's depth errors, padded for the border."""
     image = np.pad(np.asarray(device_warp((401, 401), warp_m, device), dtype=float), _BORDER, mode="edge")
     return np.asarray(spline_filter(image, 3, mode="nearest"))
 

@@ -91,8 +91,9 @@ def intrinsics_of(
     height, width = shape
     if found is None:
         raise CloudError(
-            f"{name} is a depth image of {width} x {height} pixels, and its camera's intrinsics are not known:"
-            f" {_ADVICE}, or put the camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the images."
+            f"{name} is a depth image of {width} x {height} pixels, but the intrinsics of its camera are missing. To"
+            f" give them, {_ADVICE}, or put the camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the"
+            " images."
         )
     if found.size not in ((0, 0), (width, height)):
         raise CloudError(

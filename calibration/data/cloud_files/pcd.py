@@ -93,8 +93,8 @@ def _in_sensor_frame(path: Path, points: Array, viewpoint: tuple[float, ...], fo
     if form.viewpoint != "world":
         raise CloudError(
             f"{path.name} has the VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}, and programs differ in what that"
-            " means: write 'viewpoint: sensor' into dataset.yaml where the points are in the sensor's frame,"
-            " 'viewpoint: world' where they were moved by VIEWPOINT."
+            " means. If the points are in the sensor's frame, write 'viewpoint: sensor' into dataset.yaml. If VIEWPOINT"
+            " has already been applied to the points, write 'viewpoint: world'."
         )
     missing = ~points.any(axis=1)
     wxyz = np.array(viewpoint[3:])

@@ -233,8 +233,8 @@ def two_lists(
             " into one folder as robot.csv and camera.csv, or name them."
         )
     raise DatasetError(
-        f"The names of the lists of '{source}' do not tell {missing} poses: {known}. Name them with --robot-poses and"
-        " --camera-poses."
+        f"The names of the lists in '{source}' do not show which one has {missing} poses: {known}. Name them with"
+        " --robot-poses and --camera-poses."
     )
 
 

@@ -90,8 +90,8 @@ def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
         if closed:
             ending = Path(closed[0]).suffix.lower()
             raise DatasetError(
-                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), a closed format that only software of"
-                f" {_CLOSED[ending]} reads: export each as .ply or .pcd, or its points as .npy, beside the poses."
+                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), which only software of"
+                f" {_CLOSED[ending]} can read. Export each as .ply or .pcd, or its points as .npy, beside the poses."
             )
     raise DatasetError(
         f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz,"
@@ -142,9 +142,9 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
         raise _apart(ids, clouds, source)
     if len(clouds) != n:
         raise DatasetError(
-            f"'{source}' holds {n} poses, and there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name});"
-            " without names each pose needs its cloud, in the same order: remove what has no partner, or add a column"
-            " id with the clouds' names."
+            f"'{source}' has {n} poses, but there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name})."
+            " Without names, each pose needs one cloud, in the same order. Remove what has no partner, or add a column"
+            " 'id' with the clouds' names."
         )
     return [cloud_id(p) for p in clouds], list(clouds), f"paired in order, {clouds[0].name} with the first pose"
 

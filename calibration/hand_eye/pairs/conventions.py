@@ -183,7 +183,7 @@ def _variants(robot: PoseReading, camera: PoseReading, changes: bool) -> list[tu
 
 
 def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> list[tuple[int, int]]:
-    """Index pairs of readings whose relative rotations have equal angles, as far as the data can tell."""
+    """Return index pairs of readings whose relative rotations have equal angles within the noise."""
     n = len(robot[0].X)
     i, j = _pairs(n, _PAIRS)
     angles = [np.stack([_relative_angles(one.X[:, :3, :3], i, j) for one in listed]) for listed in (robot, camera)]

@@ -237,16 +237,16 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
     if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         form = best.robot.form if best.robot.form.endswith(",inverse") else f"{best.robot.form},inverse"
         raise InconsistentPoses(
-            f"The robot poses of '{source}' contradict the pictures as given ({mounting}), and agree"
-            f" ({_residual(best)}) in two ways that the data cannot tell apart: the camera is mounted {other}"
-            f" (--mounting {other}), or the robot poses are inverted (--robot-form {form}). State the one that is true."
+            f"With --mounting {mounting} the robot poses of '{source}' contradict the pictures. Two corrections fit"
+            f" equally well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), or the robot poses"
+            f" are inverted (--robot-form {form}). Give the option that is true."
         )
     if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         raise InconsistentPoses(
-            f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in"
-            f" three ways that the data cannot tell apart: the camera is mounted {other} (--mounting {other}), the"
-            f" robot poses are inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are"
-            f" inverted (--camera-form {_option(best.camera, 'inverse')}). State the one that is true."
+            f"With --mounting {mounting} the poses of '{source}' contradict each other. Three corrections fit equally"
+            f" well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), the robot poses are"
+            f" inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are inverted"
+            f" (--camera-form {_option(best.camera, 'inverse')}). Give the option that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
@@ -375,7 +375,7 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
     raise WrongScale(
         factor,
-        f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from"
-        f" {unit} to the right length): the size of the board's squares or of the marker is wrong by that"
-        f" factor{squares}, or they have another unit. Correct the size, or multiply the positions by {factor:.4g}.",
+        f"The camera positions of '{source}' ({unit}) fit the robot's motion only when multiplied by {factor:.4g}."
+        f" The size of the board's squares or of the marker is wrong by that factor{squares}, or the unit is another"
+        f" one. Correct the size, or multiply the positions by {factor:.4g}.",
     )

@@ -78,7 +78,7 @@ class Board:
 
     @property
     def layouts(self) -> int:
-        """Number of layouts that share the string and that pictures tell apart."""
+        """Return the number of layouts that share the string and that pictures distinguish."""
         if self.kind == "charuco":
             return 2 if self.rows % 2 == 0 else 1
         return 8 if self.kind == "tags" else 1
@@ -256,7 +256,7 @@ def _off_plane(points: Array | None, board: Board) -> float | None:
 
 
 def _right_handed(points: Array, columns: int, rows: int) -> bool:
-    """Whether the columns go to the right of the rows' direction, as they do on a board that is seen from its front."""
+    """Return whether the columns go to the right of the rows' direction, as on a board from its front."""
     grid = points.reshape(rows, columns, 2)
     right, down = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0), grid[-1].mean(axis=0) - grid[0].mean(axis=0)
     return bool(right[0] * down[1] - right[1] * down[0] > 0.0)

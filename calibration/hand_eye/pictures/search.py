@@ -260,9 +260,9 @@ def _estimate(
     if file is not None:
         if file.size is not None and file.size != size:
             raise DatasetError(
-                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, and these"
-                f" have {size[0]} x {size[1]}: give the file of this resolution, or leave it out to estimate the"
-                " camera."
+                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, but these"
+                f" have {size[0]} x {size[1]}. Give the file of this resolution, or leave it out: the camera is then"
+                " estimated."
             )
         return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
     start = np.array(
@@ -299,8 +299,9 @@ def _estimate(
             free = np.append(free, 8)
     if not (0.2 * max(size) < K[0, 0] < 50.0 * max(size)) or not np.isfinite(dist).all():
         raise DatasetError(
-            f"The pictures do not determine the camera (focal length {K[0, 0]:.0f} px of {size[0]} pixels): tilt the"
-            " board by 20 to 40 degrees in some pictures, or give the camera with --intrinsics FILE."
+            f"The camera cannot be estimated from these pictures: a focal length of {K[0, 0]:.0f} px for pictures"
+            f" {size[0]} pixels wide is impossible. Tilt the board by 20 to 40 degrees in some pictures, or give the"
+            " camera with --intrinsics FILE."
         )
     return K, dist, free.astype(np.int64), pictures
 

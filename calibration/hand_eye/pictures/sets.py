@@ -186,8 +186,8 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
         lists = mine if len(mine) == 1 else others if len(others) == 1 else lists
     if len(lists) > 1:
         raise DatasetError(
-            f"The names of the lists of '{folder.name}' do not tell the robot's poses: {known}. Name them with"
-            " --robot-poses."
+            f"The names of the lists in '{folder.name}' do not show which one has the robot's poses: {known}. Name it"
+            " with --robot-poses."
         )
     return replace(lists[0], unit=lists[0].unit or unit or "")
 

@@ -1,4 +1,4 @@
-"""Sequential test of a calibration: has the scanner moved, when, by how much and which way."""
+"""Test a calibration sequentially: has the scanner moved, when, by how much and in which direction."""
 
 from dataclasses import dataclass, field
 
@@ -138,7 +138,7 @@ class DriftTest:
 
     @property
     def alarmed(self) -> bool:
-        """Whether an alarm stands whose size is still being measured."""
+        """Return whether an alarm is active whose size is still being measured."""
         return self._alarm_s is not None
 
     def current(self) -> tuple[RigidTransform, Array]:
@@ -179,7 +179,7 @@ class DriftTest:
         return out
 
     def finish(self) -> list[DriftEvent]:
-        """No more frames: settle an alarm that stands.
+        """Complete an active alarm after the last frame.
 
         Frames too few for their noise to be measured are tested with the stated one.
         """

@@ -1,4 +1,4 @@
-"""Watch a calibration over a recording: synchronise, test for drift, tell scanner from base, recalibrate."""
+"""Monitor a calibration over a recording: synchronise, test for drift, separate scanner from base, recalibrate."""
 
 import warnings
 from collections.abc import Sequence
@@ -96,7 +96,7 @@ def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: Rigid
 
 
 def _median(clouds: Sequence[Array]) -> tuple[Array, Mask]:
-    """Median point of each pixel (H, W, 3), and whether it shows one thing that stands still."""
+    """Return the median point of each pixel (H, W, 3), and whether the pixel shows one object at rest."""
     z = np.stack([c[..., 2] for c in clouds])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame measured
@@ -300,7 +300,7 @@ def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
 def _as_before(
     X_BC: RigidTransform, moves: Sequence[DriftEvent], times: Array, frames: ObservedFrames
 ) -> tuple[Array, Array]:
-    """Centres and normals (N, 3) as the scanner would have seen them from X_BC, had it not moved.
+    """Return centres and normals (N, 3) as the scanner would have measured them from X_BC, had it not moved.
 
     A creep counts from its middle.
     """

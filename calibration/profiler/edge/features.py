@@ -88,7 +88,9 @@ def _apex(p: Floats, pitch: float) -> tuple[Floats, Floats]:
             reach = sign * (x - at)
             flank = (reach > pitch) & (reach < FLANK_M)
             if flank.sum() < MINIMUM_RUN:
-                raise FeatureNotFound("The profile shows no two flanks of a blade: move until both sides are seen.")
+                raise FeatureNotFound(
+                    "The profile does not show both flanks of the blade: move until both are visible."
+                )
             lines.append(_robust_line(x[flank], p[flank, 1]))
         (a1, b1, s1, n1), (a2, b2, s2, n2) = lines
         if not (b1 < b2 and abs(b2 - b1) > 0.2):

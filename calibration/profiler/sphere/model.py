@@ -88,7 +88,7 @@ def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Where each unknown stands in the vector: pose, centre, tip, affine, joints."""
+    """Hold the index of each unknown in the vector: pose, centre, tip, affine, joints."""
 
     tip: bool
     affine: bool

@@ -45,7 +45,7 @@ def check_wrist(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> No
     if -np.sign(p_TC[2]) * across > _BEHIND_M + _BEHIND_SIGMAS * unsure:
         raise TabletDataError(
             f"Camera and pen are on different sides of the page ({1e3 * abs(p_TC[2]):.0f} and {1e3 * abs(across):.0f}"
-            " mm from it), so it is mirrored in touches or image: check that x is before y in touches and landmarks,"
+            " mm from it). The touches or the image are mirrored: check that x is before y in touches and landmarks,"
             " and u before v in the image."
         )
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))

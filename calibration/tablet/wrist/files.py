@@ -50,8 +50,8 @@ def grid_columns(shown_px: Mapping[int, Array]) -> tuple[int, int]:
         if square and right[0] * down[1] - right[1] * down[0] > 0.0:
             return columns, int(row.max()) + 1
     raise TabletDataError(
-        "The numbers and coordinates of the landmarks make no grid row by row from 0; give --seen instead of the"
-        " picture."
+        "The landmarks are not a grid that is numbered row by row from 0, which a search in the picture needs. Give"
+        " their pixels with --seen instead of the picture."
     )
 
 
@@ -254,7 +254,7 @@ def load_visit(
         found = find_page(picture, shown, look)
         uv = found[used]
     else:
-        raise TabletDataError("Give the camera's image (--image) or where the landmarks are in it (--seen).")
+        raise TabletDataError("Give the camera's image (--image), or the pixels of the landmarks in it (--seen).")
     corner = landmarks.min(axis=0)
     data = WristTouches(
         X_BF=tuple(pose_of[k] for k in used),

@@ -169,7 +169,7 @@ def linear_system(data: WristTouches) -> tuple[Array, Array]:
 
 
 def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransform, Array]:
-    """Closed form: R_BF p_FP + p_BF = r1 x + r2 y + p_BT for twelve unknowns, the open ones kept at the prior."""
+    """Solve R_BF p_FP + p_BF = r1 x + r2 y + p_BT in closed form for twelve unknowns, the open ones at the prior."""
     A, b = linear_system(data)
     # columns to a like size, so that what is open is left at its prior and not shared out by units
     guess = np.r_[np.zeros(11), 0.0 if pen_length_m is None else pen_length_m]

@@ -24,7 +24,7 @@ SUFFIXES = (".csv", ".npy")
 
 @dc.dataclass(kw_only=True)
 class FolderProfiler(WiredProfiler):
-    """`!FolderProfiler`: the folder, and how the program that writes into it is told to scan; see `!FolderScanner`.
+    """`!FolderProfiler`: the folder, and how the program that writes into it is triggered; see `!FolderScanner`.
 
     A file holds one profile: csv with the columns x and z, an empty cell where nothing was measured, or npy (n, 2).
     """

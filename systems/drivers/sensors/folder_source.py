@@ -28,7 +28,7 @@ KEEP_ALIVE = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
 class Trigger:
-    """Tells another program to scan; this one does not: that program or an operator scans once the arm is at rest."""
+    """Trigger another program. This one does nothing: that program or an operator scans once the arm is at rest."""
 
     def open(self) -> None:
         """Connect. Raises DeviceLost."""
@@ -37,7 +37,7 @@ class Trigger:
         """Ask for scan number `request`. Raises DeviceLost."""
 
     def look(self) -> None:
-        """Read what the other program said. Raises DeviceLost where it is gone, DeviceFault where it refuses."""
+        """Read the other program's answer. Raises DeviceLost where it is gone, DeviceFault where it refuses."""
 
     def close(self) -> None:
         """Disconnect; a second call has no effect."""

@@ -124,7 +124,7 @@ def _stop(process: BaseProcess, pipe: Connection) -> None:
 
 
 def _serve(pipe: Connection, make: Callable[..., Source[Any]], arguments: tuple[Any, ...]) -> None:
-    """The process: follows the commands of the pipe until it is told to end, or nobody is at its other end."""
+    """Follow the commands of the pipe until the command to end, or until its other end is closed."""
     source, is_open = make(*arguments), False
     parent = os.getppid()
     with suppress(EOFError, OSError):

@@ -98,8 +98,8 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     middle = float(np.median(z))
     if not 0.0 < middle <= FAR * far_m:
         raise Garbage(
-            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit"
-            " to the unit of its points, and let it send them in the frame of its camera"
+            f"the middle of the cloud is {middle:.3g} m away, but the scanner's range is {far_m:.3g} m: set scanner.unit"
+            " to the unit of its points, and make the scanner send them in its camera frame"
         )
     return cloud
 

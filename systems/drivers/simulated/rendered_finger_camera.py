@@ -28,7 +28,7 @@ COVERED_GREY = 25  # of a lens under spatter
 
 
 class TagView:
-    """The tag of a tool in a pinhole camera. All that is seen is flat, so its picture is a homography of the print.
+    """Render the tag of a tool in a pinhole camera. The tag is flat, so its picture is a homography of the print.
 
     A renderer takes ten times as long for the same picture.
     """

@@ -64,7 +64,7 @@ class RenderedScanner(ScannerConfig):
     knock_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def knock(self, X_BC: RigidTransform) -> RigidTransform:
-        """The displacement in the base of a scanner at ``X_BC`` when its stand is knocked."""
+        """Return the displacement, in the base, of a scanner at ``X_BC`` whose stand is hit."""
         R = RotationMatrix(exp_rotation(np.deg2rad(self.knock_deg)))
         p = X_BC.translation()
         return RigidTransform(R, p + 1e-3 * np.array(self.knock_mm) - R @ p)

@@ -72,7 +72,7 @@ class StreamingScanner(RenderedScanner):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Streaming(Message):
-    """Instants of the frame that is being exposed, and the frames that are under way or have arrived."""
+    """Hold the instants of the frame that is being exposed, and the frames in transit or arrived."""
 
     count: int = 0
     instants: tuple[NDArray[np.float32], ...] = ()
@@ -154,7 +154,7 @@ class DepthStream(LeafSystem):
         state.get_mutable_abstract_state(self._state).set_value(new)
 
     def _exposed(self, s: _Streaming, capture: float) -> _Streaming:
-        """The frame of the completed exposure joins those under way; no frame overtakes another one."""
+        """Add the frame of the completed exposure to those in transit; no frame overtakes another one."""
         rng = np.random.default_rng([self._seed, s.count])
         points = exposed_cloud(self._preset, s.instants, s.dark, rng)
         arrival = capture + self._timing.delay(rng)

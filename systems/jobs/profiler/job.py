@@ -122,7 +122,7 @@ class Profiler(Job[PlanningContext]):
         job = scenario.part(ProfilerJob)
         if job is not None and "sphere" in job.stages and not station.diagram.HasOutputPort("torch.touch"):
             raise InputError(
-                "Nothing tells when the torch touches the sphere in this cell: add touch_probe: !UrTouchProbe {host:"
+                "This cell cannot detect when the torch touches the sphere: add touch_probe: !UrTouchProbe {host:"
                 " ..., input: ...}, or write profiler_job: {stages: [edge]}."
             )
         return planning_context(scenario, station)

@@ -1,4 +1,4 @@
-"""TouchProcedure: scans the part, then lowers the soft tip onto each place until the finger camera sees it give way."""
+"""Scan the part, then lower the soft tip onto each place until the finger camera measures its deflection."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar

@@ -288,8 +288,8 @@ def _require_space(sheet: Sheet, width: float, height: float, paper: str) -> Non
     room = (sheet.width - 2.0 * MARGIN_MM, sheet.height - 2.0 * MARGIN_MM - FOOT_MM)
     if width > room[0] or height > room[1]:
         raise InputError(
-            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, which has room for {room[0]:.0f} x {room[1]:.0f} mm:"
-            " take a larger --paper, or less."
+            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, whose printable area is {room[0]:.0f} x"
+            f" {room[1]:.0f} mm. Take a larger --paper, or fewer or smaller squares."
         )
 
 

@@ -131,7 +131,7 @@ def look_at_cell(
 
 
 def _stands_at(scenario: Scenario, seed: int) -> Array:
-    """Where a simulated arm stands (6,) rad: at the best calibration pose before a simulated scanner, else at home."""
+    """Return joints (6,) rad of a simulated arm: at the best calibration pose of a simulated scanner, else at home."""
     home: Array = np.deg2rad(scenario.home_deg)
     simulated = scenario.robot.SIMULATED and scenario.scanner.SIMULATED
     if not simulated or not scenario.job.calibrate or scenario.calibration.configuration != "eye_on_base":

@@ -276,7 +276,7 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
         _same_size(size, picture, name)
         found = detect_tag(picture, camera.K, tag, distortion=camera.distortion)
         if not found.valid or found.X_KM is None:
-            raise InputError(f"'{table.name}', line {line}: the tag is not seen in {row['picture']}: {found.reason}")
+            raise InputError(f"'{table.name}', line {line}: no tag was found in {row['picture']}: {found.reason}")
         if not any(row[key] for key in COLUMNS):
             rest = found
             continue

@@ -458,7 +458,7 @@ def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseCon
 
 
 def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
-    """The pose of a part that stands on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
+    """Return the pose of a part on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
     R = RotationMatrix.MakeZRotation(np.deg2rad(turn_deg)).matrix()
     x, y = np.array(PLACE_M) - (R @ middle_P)[:2]
     z = scenario.calibration.table_z_m - float(mesh.bounds[0, 2])

@@ -141,7 +141,7 @@ def kind_in_words(kind: Any) -> str:
 
 @cache
 def json_schema() -> dict[str, Any]:
-    """The schema; drivers are told apart by their keys, because a JSON schema does not see a YAML tag."""
+    """Return the schema; drivers are recognised by their keys, because a JSON schema has no YAML tags."""
     meanings = {key.name: key.meaning for key in keys_of(Scenario)}
     return {"$schema": DIALECT, "title": "weldcal scenario", **_object(scenario_class(), meanings)}
 

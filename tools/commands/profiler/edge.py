@@ -79,7 +79,7 @@ def edge(
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial
+    """Calibrate the profiler's pose on the flange by points of one straight edge, from any poses. Needs no initial
     guess."""
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)

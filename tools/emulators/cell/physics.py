@@ -78,7 +78,7 @@ class Repeatability:
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
-    """The simulated station of a scenario whose arm stands where its controller has moved it.
+    """Return the simulated station of a scenario whose arm is where its controller has moved it.
 
     All else follows from `seed`.
 
@@ -143,7 +143,7 @@ class Physics:
         self._touches = False
 
     def step(self, q: Array, qd: Array, arc: Arc) -> None:
-        """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc` tells whether the arc burns."""
+        """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc`: whether the arc burns."""
         self._frame += 1
         self.time_s = STEP_S * self._frame
         true_q = self._true_q = self._joints.true_joints(q, qd)

@@ -141,13 +141,13 @@ class Streamer:
         self.knocked_at_s: float | None = None
 
     def knock(self, now: float) -> None:
-        """Knock the scanner's stand at `now`, s of the world.
+        """Displace the scanner's stand at `now`, s of the world.
 
         Raises InputError where the world's scenario has no such stand.
         """
         if self._knock_s is None:
             raise InputError(
-                "Write scanner.knock_s and knock_mm in the world's scenario: then its stand can be knocked."
+                "The scanner's stand cannot be displaced: write scanner.knock_s and knock_mm in the world's scenario."
             )
         self.knocked_at_s = now if self.knocked_at_s is None else self.knocked_at_s
 

@@ -192,7 +192,7 @@ class _World:
 
     def _knock(self) -> None:
         if self._streamer is None:
-            raise InputError("Only the stand of a scanner that streams is knocked.")
+            raise InputError("Only the stand of a scanner that streams can be displaced: use a scenario with one.")
         self._streamer.knock(self._physics.time_s)
         self.write()
 
@@ -226,7 +226,7 @@ class _World:
             self._waiter.send(self._pictures.popleft()[1])
 
     def answer_scanner(self) -> None:
-        """Tell the scanner how the world stands, where it has asked."""
+        """Send the scanner the state of the world, where it has asked."""
         if self._scans is not None:
             self._scans.answer(self._physics.time_s)
 

@@ -34,7 +34,7 @@ found nothing)."""
 
 
 def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
-    """Every way on the same simulated PhoXi M scans; single thread where the method's library lets us ask for it.
+    """Time every method on the same simulated PhoXi M scans; on one thread where its library allows that.
 
     ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
     """

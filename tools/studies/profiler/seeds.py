@@ -241,7 +241,7 @@ def _apart(e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floa
 def predicted_mm(
     e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats, rng: np.random.Generator
 ) -> float:
-    """Mean distance that points seen and touched will have, by the bound and by the noise of seeing them."""
+    """Return the mean distance that measured and touched points will have, by the bound and by the sensor's noise."""
     at, X = _apart(e, arm, q, seen, q_touch)
     steps = 1e-3 * np.sqrt(np.diag(e.whole))
     J = np.stack(

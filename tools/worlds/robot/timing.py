@@ -27,7 +27,7 @@ STEP_JOINT = 5
 
 @dataclass(kw_only=True)
 class Tap:
-    """Stands between the arm's LeafSystem and its link, and notes when what passes.
+    """Sit between the arm's LeafSystem and its link, and record when what passes.
 
     Times in s of the monotonic clock.
     """

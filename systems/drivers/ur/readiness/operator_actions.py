@@ -123,7 +123,7 @@ def payload(owner: str, text: str) -> str:
 
 
 def mounting(wanted: str) -> str:
-    """The operator action where the robot is mounted in another way than in the scenario."""
+    """Return the operator action where the robot's mounting is not the scenario's."""
     return (
         "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the"
         f" pendant, or correct base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."

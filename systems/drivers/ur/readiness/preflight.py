@@ -359,7 +359,7 @@ class _Look:
         self._ok("registers", f"{ranges(list(claims))} free{stale}")
 
     def _check_model(self) -> None:
-        """Whether the controller's arm is the scenario's, as far as their names tell them apart."""
+        """Check that the controller's arm is the scenario's, as far as their names differ."""
         wanted = self._nominal.name
         if self._is_x():
             self._ok("model", "not readable on PolyScope X; the kinematics tell")

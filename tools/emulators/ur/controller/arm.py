@@ -64,7 +64,7 @@ class Task:
 
 
 class Compliance:
-    """The deviation under way."""
+    """Hold the current deviation."""
 
     def __init__(self, model: ArmModel, q: Array, qd: Array, p_FT: Array, task: Task) -> None:
         self.nominal = Nominal(model, q.copy(), qd.copy(), p_FT)
@@ -72,7 +72,7 @@ class Compliance:
         self._moved, self._turned, self._speed = np.zeros(3), np.eye(3), np.zeros(6)
 
     def velocity(self, q: Array, X_FT: Array, qd_nominal: Array, wrench: Array, live: bool) -> Array:
-        """Joint velocity (6) of the real arm at q for the next step; while it is not live the deviation stands still.
+        """Return the joint velocity (6) of the real arm at q for the next step; not live, the deviation is frozen.
 
         Raises:
             MotionRefused: the deviation leads out of reach.
@@ -107,7 +107,7 @@ def force_task(
 
 
 def free_task(frame: list[float], free_axes: Array) -> Task:
-    """The task of freedrive: every free axis gives way to the hand."""
+    """Return the task of freedrive: every free axis follows the hand."""
     return Task(matrix(frame), free_axes, np.zeros(6), 2, FREE_LIMITS, FREE_DAMPING)
 
 
@@ -183,7 +183,7 @@ class ForceSensor:
 
 
 class EmulatedArm:
-    """Targets and actual values of six joints (rad, rad/s, rad/s^2), the tool frame, and the motion under way."""
+    """Hold targets and actual values of six joints (rad, rad/s, rad/s^2), the tool frame, and the current motion."""
 
     def __init__(self, model: ArmModel, q: Array) -> None:
         self.model = model
@@ -230,7 +230,7 @@ class EmulatedArm:
         return self if self.compliance is None else self.compliance.nominal
 
     def step(self, driven: bool, scaling: float, live: bool = True) -> None:
-        """Moves by one step; where it is not driven it brakes, and where it is not live force mode stands still.
+        """Move by one step; where it is not driven it brakes, and where it is not live force mode is frozen.
 
         Raises:
             MotionRefused: the arm cannot follow; it has begun to brake.

@@ -98,7 +98,7 @@ class ControllerState:
         self._later.append((self.frame + round(seconds / STEP_S), action))
 
     def pause_program(self) -> None:
-        """The program stands still and the arm brakes on its path; `resume_program` continues from there."""
+        """Pause the program and brake the arm on its path; `resume_program` continues from there."""
         if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
             self.runtime_state = RuntimeState.PAUSING
 

@@ -24,7 +24,7 @@ LARGEST = 1e9  # of the numbers that a request may hold
 
 
 class LoopWorld:
-    """What the loop itself needs to know: how long it stands still, is unplugged, jitters, and when it ends."""
+    """Hold what the loop itself needs: how long it pauses, is unplugged, jitters, and when it ends."""
 
     def __init__(self) -> None:
         self.frozen_until = 0.0

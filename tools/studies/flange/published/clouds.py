@@ -226,7 +226,7 @@ def study_clouds(
 
 
 def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Material:
-    """Fit every cloud both ways; clouds that either method refuses are left out of the comparison."""
+    """Fit every cloud by both methods; clouds that either method refuses are left out of the comparison."""
     seen = fit_flanges(data, standard, seed=seed)
     good = {o.id: o for o in seen.observations}
     clouds = {id: data.cloud(id) for id in data.clouds if id in good}

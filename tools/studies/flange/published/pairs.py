@@ -88,7 +88,7 @@ def load_runs(folder: Path) -> StoredRuns | None:
 def study_pairs(
     name: str, title: str, pairs: list[Observation], runs: StoredRuns | None, *, repeats: int, seed: int
 ) -> PairsOutcome:
-    """Table 1's row, the truth of the stored runs, and held-out errors of both ways to use all pairs."""
+    """Return Table 1's row, the truth of the stored runs, and held-out errors of both methods on all pairs."""
     estimate = estimate_eye_on_base(pairs, SolveConfig(seed=seed, leave_one_out=False))
     good = [o for o, keep in zip(pairs, estimate.inliers, strict=True) if keep]
     outliers = tuple(o.id for o, keep in zip(pairs, estimate.inliers, strict=True) if not keep)
