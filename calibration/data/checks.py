@@ -1,4 +1,4 @@
-"""Read dataset.yaml and CSV tables, and check them: rows, numbers, quaternions, units, clouds that repeat."""
+"""Read dataset.yaml and CSV tables, and check them: rows, numbers, quaternions and units; hashes of files."""
 
 import csv
 import math

@@ -57,10 +57,7 @@ SECOND_JOINTS = tuple(f"second_q{k}" for k in range(1, 7))
 
 @dataclass(frozen=True)
 class Pair:
-    """A centre found by other means.
-
-    Camera point (3,) m and the robot's pose of the feature (rotation identity where not given).
-    """
+    """A centre (3,) m of C found by other means, and the feature's pose (rotation identity where not given)."""
 
     id: str
     X_BR: RigidTransform
@@ -96,11 +93,9 @@ class Dataset(Recorded):
         return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
 
     def between(self, ids: str) -> Self:
-        """Return the dataset without the scans before or after those named "FROM:TO", in its order.
+        """Return the dataset from the scan FROM to the scan TO of "FROM:TO", ids of which either may be left out.
 
-        FROM and TO are ids; either may be left out.
-
-        Raises DatasetError where there is no colon, an id is not in the dataset, or FROM stands after TO.
+        Raises DatasetError where there is no colon, an id is not in the dataset, or FROM comes after TO.
         """
         first, colon, last = (part.strip() for part in ids.partition(":"))
         known = [p.id for p in self.pairs] or list(self.clouds)

@@ -120,7 +120,7 @@ def solve_jointly(
 
 def _fit(good: Sequence[Observation], patterns: Mapping[str, HolePattern], X_rigid: RigidTransform, seed: int) -> _Fit:
     """Estimate pose and correction from poses without outliers (n >= 4), and decide on the correction."""
-    motion, holes, contradict = None, None, False
+    motion, holes, contradict = None, None, False  # each alone, only to see whether the two sources contradict
     if len(good) >= _LEAST_TO_COMPARE:
         motion = from_motion(good, {}, seed=seed, start=X_rigid)
         holes = from_holes(good, patterns)

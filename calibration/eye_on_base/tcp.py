@@ -16,7 +16,7 @@ from weldcal.models.arrays import Array
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
 _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
 _ARM_M = 5e-4  # a choice: a maker's calibration usually leaves 0.4 mm; half would name joint errors as a TCP
-"""What arms err systematically per coordinate (1 mm a point).
+"""What arms err systematically per coordinate.
 
 However such errors are spread over the poses, they move the offset by no more than the norm of its row of the
 pseudo-inverse times theirs: a weak geometry makes much of little.

@@ -414,7 +414,7 @@ def _domed(w: _Window, ring: Mask, rho2: Array, plane: PlaneFit) -> bool:
 
 
 def _thin(ring: Mask) -> tuple[slice, slice]:
-    """Every so manieth pixel along rows and columns that some thousands of a ring's remain."""
+    """Every k-th pixel along rows and columns, so that some thousands of the ring remain."""
     step = slice(None, None, max(1, int(np.sqrt(np.count_nonzero(ring) / _PLANE_POINTS) + 0.5)))
     return step, step
 

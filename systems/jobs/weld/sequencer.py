@@ -51,9 +51,8 @@ class JobState(ProcedureState):
         label: of the newest scan.
         streaming: the finger camera streams.
         process_on: the process is enabled.
-        seam: number of the seam that is planned and welded, from 0.
         view: number of the newest scan of the workpiece, from 0.
-        seam: number of the seam that is planned and welded, from 0; piece: of its pieces, where it is interrupted.
+        seam: number of the seam that is planned and welded, from 0; piece: of that seam's pieces.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
     """
