@@ -181,13 +181,13 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
         header = read_header(description)
     if header.mode == "motion":
         raise DatasetError(
-            f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read"
-            " it. This command needs scans at rest, with poses.csv."
+            f"'{folder.name}' is a recording in motion (mode: motion), and this command needs scans at rest, with"
+            " poses.csv. Give the recording to 'weldcal calibrate' or 'weldcal monitor'."
         )
     if header.configuration != CONFIGURATIONS[0] and not carried:
         raise DatasetError(
-            f"'{folder.name}' is of a scanner that an arm carries ({header.configuration}); only 'weldcal calibrate'"
-            " reads it. This command needs a scanner beside the robot (eye_on_base)."
+            f"'{folder.name}' has scans of a scanner on an arm ({header.configuration}), and this command needs a"
+            " scanner beside the robot (eye_on_base). Give the folder to 'weldcal calibrate'."
         )
     hashes = {} if bare else {"dataset.yaml": digest(description)}
     if header.poses is not None and header.poses.file:
@@ -442,8 +442,8 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
             else ("clouds: mm" if metres[1] else "poses: m")
         )
         raise DatasetError(
-            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
-            f"millimetres; correct units in dataset.yaml to '{cure}'."
+            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's. One of the two is "
+            f"in millimetres: correct units in dataset.yaml to '{cure}'."
         )
     check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
     return tuple(pairs)

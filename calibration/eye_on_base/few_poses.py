@@ -99,7 +99,7 @@ def _with_turn(observations: Sequence[Observation], patterns: Mapping[str, HoleP
             "The scans show the flange's threads but not its dowel hole. The rotation about the axis is therefore one of "
             f"{', '.join(f'{t:.0f}' for t in sorted(turns))} degrees. Clear the dowel hole, or take four poses or more."
         )
-    raise TooFewPoses("No scan shows the flange's holes well enough; scan from nearer or take four poses and more.")
+    raise TooFewPoses("No scan shows the flange's holes well enough. Scan from nearer, or take four poses or more.")
 
 
 def calibrate_from_few(

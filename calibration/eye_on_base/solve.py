@@ -107,15 +107,15 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to"
-            f" {100 * config.max_outliers:.0f} % outliers are excluded); check units, pose order and that the camera"
-            " did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (at most"
+            f" {100 * config.max_outliers:.0f} % may be outliers). Check the units and the order of the poses, and that"
+            " the camera did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
         raise InconsistentPoses(
-            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis; check units, pose order, the"
-            " quaternion order and that the camera did not move."
+            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis. Check the units, the order of the"
+            " poses and of the quaternion's numbers, and that the camera did not move."
         )
     if not inliers.all():
         check_diversity(

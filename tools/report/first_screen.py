@@ -81,7 +81,7 @@ ENOUGH_UNSEEN = 4
 """Unseen poses (scans, frames, landmarks) from which on they back a verdict; `verify` asks for as many new scans."""
 MOST_CONCERNS = 3
 NO_TOLERANCE = (
-    "No tolerance is stated, so nothing says whether this is good enough for your job: state it with --limit-mm."
+    "No tolerance is stated, so this result cannot be judged for your job. State the allowed error with --limit-mm."
 )
 
 

@@ -68,7 +68,7 @@ class HandEyeReport:
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
         after = (
-            Next(f"To know it better, add a pose. {self.advice}")
+            Next(f"To reduce the uncertainty, add a pose. {self.advice}")
             if self.advice
             else Next("Compare with poses that were not in the file: the target must stay where the result puts it.")
         )

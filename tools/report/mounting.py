@@ -160,7 +160,7 @@ class MountingReport:
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         after = "Use the pose; calibrate again after the scanner was moved."
         if status.next_best is not None:
-            after = f"To know it better, add the pose {status.next_best.sentence()}"
+            after = f"To reduce the uncertainty, add the pose {status.next_best.sentence()}"
         elif tolerance is not None and not tolerance.met:
             after = "Add poses that are turned more and lie farther apart, and calibrate again."
         return FirstScreen(found, expected, Next(after), shown_poses(result, self.mounting))

@@ -229,9 +229,10 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
         if decision.rivals or best.changed:
             runner = decision.rivals[0] if decision.rivals else best
             raise InconsistentPoses(
-                f"The poses of '{source}' contradict each other in every known reading. Best: {_pair_words(best)},"
-                f" {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that row k of both lists"
-                " is of the same moment, or state the forms with --robot-form and --camera-form."
+                f"The poses of '{source}' contradict each other in every known convention. The best is"
+                f" {_pair_words(best)}, {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that"
+                " row k of both lists was recorded at the same moment. Or state the conventions with --robot-form and"
+                " --camera-form."
             )
         return
     if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
@@ -251,7 +252,7 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
     if decision.rivals:
         rival = decision.rivals[0]
         raise InconsistentPoses(
-            f"The poses of '{source}' agree in more than one reading, and the results differ: {_pair_words(best)}"
+            f"The poses of '{source}' agree in two conventions, with different results: {_pair_words(best)}"
             f" ({_residual(best)}), or {_pair_words(rival)} ({_residual(rival)}). State the right one:"
             f" {_options(best)}, or {_options(rival)}."
         )
@@ -328,14 +329,14 @@ def _units(
             words[0] = "m"
         else:
             raise DatasetError(
-                f"The robot positions of '{source}' have a median of {median:.3g} from the base: that is neither metres"
-                " nor millimetres of an arm. State the unit with --unit m, mm, cm or inch."
+                f"The median distance of the robot positions of '{source}' from the base is {median:.3g}. An arm's"
+                " reach is neither that in metres nor in millimetres. State the unit with --unit m, mm, cm or inch."
             )
     unit_r = UNITS[words[0]]
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
         raise DatasetError(
-            f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]};"
-            " correct --unit."
+            f"Read in {words[0]}, the robot positions of '{source}' have a median distance of {median * unit_r:.3g} m"
+            " from the base. No arm has that reach: correct --unit."
         )
     ratio = None
     if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:
@@ -363,14 +364,14 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
     if near != unit and abs(np.log(ratio / UNITS[near])) < _OTHER_UNIT:
         raise InconsistentPoses(
-            f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct"
-            f" the unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
+            f"The camera positions of '{source}' fit the robot's motion in {near}, but {unit} is stated. Correct the"
+            f" unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
         )
     if abs(np.log(factor)) > _OTHER_SIZE:
         raise InconsistentPoses(
-            f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g}: the"
-            " robot's or the camera's positions are in another unit, or of unknown scale. State the unit of both with"
-            " --unit, or multiply the positions of one list."
+            f"The camera positions of '{source}' fit the robot's motion only when multiplied by {factor:.4g}. One of"
+            " the two lists has another unit, or an unknown scale. State the unit of both with --unit, or multiply the"
+            " positions of one list."
         )
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
     raise WrongScale(

@@ -187,7 +187,7 @@ def test_pairs_are_read_and_mixed_units_are_noticed(tmp_path: Path) -> None:
     assert len(data.pairs) == 5
     assert not data.pairs[0].has_orientation
     change(tmp_path / "dataset.yaml", "clouds: m,", "clouds: mm,")
-    with pytest.raises(DatasetError, match="one of them is in millimetres"):
+    with pytest.raises(DatasetError, match="One of the two is in millimetres"):
         load_dataset(tmp_path)
 
 

@@ -263,7 +263,7 @@ def test_joint_angles_do_not_stand_for_a_missing_column(scans: Path, missing: st
 def test_scans_of_a_carried_scanner_are_sent_to_calibrate(scans: Path, configuration: str) -> None:
     np.save(scans / "poses.npy", X)
     (scans / "dataset.yaml").write_text(f"schema: 1\nconfiguration: {configuration}\n")
-    with pytest.raises(DatasetError, match="only 'weldcal calibrate' reads it"):
+    with pytest.raises(DatasetError, match="Give the folder to 'weldcal calibrate'"):
         load_dataset(scans)
 
 
