@@ -75,7 +75,7 @@ class WeldingTool:
     The defaults are the welding tool of the paper's figure; a tool file gives the fields at the end, which replace what
     follows from the others (models/tools).
 
-    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper); the tag rides
+    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper). The tag rides
     on it and the finger camera looks at the tag along +z_F. The torch trails the tip by `chord_m` along -x_T.
     """
 

@@ -81,7 +81,7 @@ def read_cloud(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are
+    centres at whole numbers. Zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are
     the first three columns, below a header or none. Points with NaN or at 0 0 0 were not measured: they are NaN in
     organised clouds and left out of lists. A list in the sensor's order that keeps them becomes organised.
 

@@ -88,7 +88,7 @@ class DatasetHeader:
 
     ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and ``depth_scale``
     (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means. Of a scanner that an arm
-    carries: ``scanner_guess`` is its pose on its carrier; ``scanner_link`` the link that carries it (eye_on_arm),
+    carries: ``scanner_guess`` is its pose on its carrier. ``scanner_link`` the link that carries it (eye_on_arm),
     ``second_robot`` the arm that shows its flange (co_manipulation), ``arm_error_mm`` the rms error of the flange's
     reported position.
     """

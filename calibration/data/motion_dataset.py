@@ -166,7 +166,7 @@ def save_motion_dataset(
     """Record a motion as a folder that load_motion_dataset reads back.
 
     ``clouds`` gives (id, points in metres (N, 3) or (H, W, 3)) one after the other, so that they need not be in memory
-    together; ``intrinsics`` writes organised clouds as depth maps.
+    together. ``intrinsics`` writes organised clouds as depth maps.
 
     The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and
     metres.

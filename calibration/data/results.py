@@ -57,12 +57,12 @@ class IcpRecord:
 class CalibrationResult:
     """Contents of calibration.yaml.
 
-    ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin; ``joint_covariance`` (6 +
-    K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one; ``clock`` of the scanner and
+    ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin. ``joint_covariance`` (6 +
+    K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one. ``clock`` of the scanner and
     ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as they were
     estimated, where the calibration was made in motion. With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and
     ``target`` the centre (3,) m and normal (3,) of what was seen, in the base. ``axis_turn_deg`` how far the hole
-    pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of what --refine
+    pattern is turned about the flange's axis, and its spread over the scans. ``local_field``: document of what --refine
     local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
     ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean
     (quaternion wxyz) of the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses

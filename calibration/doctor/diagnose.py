@@ -1,7 +1,7 @@
 """Name the causes that the scans give evidence of, misread data among them, the likeliest first.
 
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the
-Bayesian information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a
+Bayesian information criterion (fit.py). The difference must exceed a threshold for each cause, and the disturbance a
 size that matters. The thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its
 false alarms are counted on.
 """

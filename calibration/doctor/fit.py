@@ -31,7 +31,7 @@ class CauseFit:
 
     Residuals of centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
 
-    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers
+    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's). ``occam`` is what numbers
     with a prior cost: the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
     """
 

@@ -22,7 +22,7 @@ def sampling_advice(
     """Advice from an estimate and the observations that made it (outliers are ignored).
 
     Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
-    field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard
+    field a scanned point is worst known, and what one more pose like these would gain. With ``required_m`` (standard
     deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
     """
     used = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]

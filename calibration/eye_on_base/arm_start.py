@@ -62,8 +62,8 @@ class ArmShape:
 class ArmStart:
     """Where the scanner seems to stand.
 
-    ``explained``: share of the moving points on the arm; ``seen_through``: share of the arm's surface in view behind
-    which the scanner measured; ``next_best``: the score of the best other place; ``score`` of this one.
+    ``explained``: share of the moving points on the arm. ``seen_through``: share of the arm's surface in view behind
+    which the scanner measured. ``next_best``: the score of the best other place. ``score`` of this one.
     """
 
     X_BC: RigidTransform
@@ -138,7 +138,7 @@ def face_guess(points: Array, X_CR: RigidTransform, standard: FlangeStandard) ->
     The pose is right to some centimetres.
 
     The face is where most points lie on the ring, and fewest in the bore and just outside, on a plane
-    along the expected axis; plane and place are found in turns.
+    along the expected axis. Plane and place are found in turns.
 
     Raises:
         FlangeNotFound: no face is there.
@@ -260,7 +260,7 @@ def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int =
     None where too little of the arm is seen.
 
     What stands still in two clouds or more is no arm. Points of a scan with their normals are laid on points of the
-    arm's surface, turned about the common normal; the scanner then must see the arm's surface wherever nothing hides
+    arm's surface, turned about the common normal. The scanner then must see the arm's surface wherever nothing hides
     it, and nothing behind it. The best hypotheses are refined by Gauss-Newton with a common allowance on the radii.
     """
     rng = np.random.default_rng(seed)

@@ -47,7 +47,7 @@ def estimate_from_whole_poses(
     """X_BC from the observations whose hole pattern shows its rotation (n >= 1): each gives all six degrees of freedom.
 
     ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says
-    it is; ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged
+    it is. ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged
     (chordal mean), then centres. Raises TooFewPoses where no scan shows one.
     """
     seen = _with_turn(observations, patterns)

@@ -187,7 +187,7 @@ def choose_reading(
 
     Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the
     rigid X_BC that fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom,
-    m of the n scans being no outliers, and more of centres; a reading whose residuals exceed those of the best by more
+    m of the n scans being no outliers, and more of centres. A reading whose residuals exceed those of the best by more
     than the quantile of F(2 m - 3, 2 m - 3) for CHANCE is rejected.
 
     Args:

@@ -90,7 +90,7 @@ def estimate_eye_on_base(
     """Estimate X_BC from observations of the flange at n poses, from positions and (if any) normals together.
 
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
-    of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
+    of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate. The variances of positions and
     of normals are estimated from the residuals (Helmert's simplified estimator, each group divided by its own
     redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn (of more than 100
     poses: without each of 100 groups). Deterministic for ``config.seed``. Raises TooFewPoses, RepeatedPoses,

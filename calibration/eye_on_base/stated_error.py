@@ -38,7 +38,7 @@ def stated_median_limit(
     pose and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and
     scanner and the noise of its fit. The spread was estimated from few residuals, so its square is drawn as well
     (scaled inverse chi-square). A calibration with a local field states the spread (n,) m per axis that this leaves at
-    each scan: ``scatter_m``; one with errors of the arm what these contribute: ``shared``, derivatives (n, 3, p) of the
+    each scan: ``scatter_m``. One with errors of the arm what these contribute: ``shared``, derivatives (n, 3, p) of the
     positions and the covariance (p, p) in place of the result's. A calibration states its held-out errors besides:
     their 95 % percentile counts where it is larger. None where it states no error at all. Deterministic.
     """

@@ -37,9 +37,9 @@ _SINGULAR = 1e-6  # a choice between rounding (1e-15) and real motions, of colum
 class TcpOffset:
     """A TCP that the poses seem to carry.
 
-    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite
-    where these poses do not show it; ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the
-    residuals, may pretend at most; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability``
+    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z. ``sigma_m`` (3,), infinite
+    where these poses do not show it. ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the
+    residuals, may pretend at most. ``with_m`` and ``without_m`` rms of the centres with and without it. ``probability``
     that chance alone does as much.
     """
 

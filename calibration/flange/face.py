@@ -334,7 +334,7 @@ def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
 
     Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough
+    sideways. Away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough
     face is thicker than the ``chamfer`` (m) is deep: it ends with it, and on the side that shows its wall one thickness
     below the plane (docs/flange.md).
     """

@@ -57,9 +57,9 @@ class FlangeGuess:
 class FlangeFit:
     """A flange found in a cloud, camera frame C, metres.
 
-    ``center_C`` (3,) centre of the concentric edges in the face plane; ``normal_C`` (3,) outward, towards the scanner;
+    ``center_C`` (3,) centre of the concentric edges in the face plane. ``normal_C`` (3,) outward, towards the scanner.
     ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad (per axis) cover the noise of this scan, not the scanner's
-    systematic error; ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen);
+    systematic error. ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen).
     ``coverage`` is the share 0..1 of the outer edge that was seen, ``on_grid``
     whether it was measured on a pixel grid. ``plane_rms_m``, ``outer_rms_m`` and ``bore_rms_m`` are
     the residuals of each feature, ``rim_rms_m`` of both edges together.
@@ -91,7 +91,7 @@ def fit_flange(
 
     The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one
     decides. Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a
-    search of the guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
+    search of the guess's surroundings. Without a guess a search of the whole scan. Unordered clouds: the same on the
     sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the
     flange's size.
 

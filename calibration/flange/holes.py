@@ -34,7 +34,7 @@ class HolePattern:
 
     ``rms_m`` is the root mean square of how far the holes lie from their places in the pattern.
     ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation
-    then translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
+    then translation, in the camera's axes. Both cover this scan's noise and how well the holes agree.
     ``other_turns_rad`` are rotations about the axis, from that of X_CR, under which the scan shows the pattern as well
     (the threads alone are symmetric; the dowel hole decides): the spread then covers all of them, and ``turn_known`` is
     false.

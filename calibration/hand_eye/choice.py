@@ -143,7 +143,7 @@ def fit(
 
     Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre
     is an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
-    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so
+    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it. So
     the answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
     see Scaled. ``keep`` (n,): observations that count; the others get residuals only. ``begin``: the derivatives at the
     start, where known. ``tolerance``: of what is left, in standard deviations.

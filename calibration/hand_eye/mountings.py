@@ -118,8 +118,8 @@ MOUNTINGS: dict[str, Mounting] = {
 class TargetObservation:
     """One observation of the target.
 
-    ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that carries the
-    camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
+    ``X_BF``: flange in base (of the robot with the camera where there are two). ``X_BL``: the link that carries the
+    camera (eye_on_arm only). ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
     Measured: ``p_CM`` (3,) always, with ``n_CM`` (3,) the unit z axis of the target (its normal) or ``R_CM`` all of its
     rotation where known. ``covariance`` (6, 6) [rotation; translation] of the measurement in the target's axes, None

@@ -141,7 +141,7 @@ def linearise(problem: Problem, state: State, centre: Array) -> Linearised:
     """Residuals and analytic derivatives; ``centre`` (3,) in T is the point whose displacement a full pose reports.
 
     Derivation: with M = F X G, L = Y H Z, D = L^-1 M, a change (a, b) of X turns D by R_L^T R_F a and moves the point
-    by R_L^T R_F (a x R_X g + b); a change of Y or Z does so with the opposite sign and its own lever arm.
+    by R_L^T R_F (a x R_X g + b). A change of Y or Z does so with the opposite sign and its own lever arm.
     """
     w, d, point, RL, g, turn = _evaluate(problem, state, centre)
     X, Y, Z = state

@@ -34,9 +34,9 @@ _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decim
 class HandEyeConfig:
     """Settings.
 
-    ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive; ``allow_open``: give
-    an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot pose
-    are one observation; ``usual_discord_rad``: angle by which rotations and positions of the camera disagree
+    ``folds``: of the held-out errors (0: none). ``max_outliers``: share of gross ones to survive. ``allow_open``: give
+    an answer even where more than one direction of translation stays open. ``join_repeats``: samples at one robot pose
+    are one observation. ``usual_discord_rad``: angle by which rotations and positions of the camera disagree
     beforehand.
     """
 
@@ -77,7 +77,7 @@ class HandEyeResult:
 
     ``poses``: X, Y, Z as far as they were unknown. ``covariance`` (6, 6) each, [rotation; translation]: X = (exp(a) R,
     p + b), a (rad) a rotation on the parent's side about the child's origin, b the displacement of that origin, both in
-    the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
+    the parent's axes. Open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
     ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target

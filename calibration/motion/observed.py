@@ -17,8 +17,8 @@ _MOST_DRIFT = 1e-2  # a choice: a hundred times what crystals are off (100 ppm);
 class ObservedFrames:
     """N frames in the order of their arrival.
 
-    ``arrival`` (N,) s on the robot's clock; ``device`` (N,) s on the scanner's own clock, NaN where a frame has none,
-    or None; ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame; ``covariance`` (N, 3,
+    ``arrival`` (N,) s on the robot's clock. ``device`` (N,) s on the scanner's own clock, NaN where a frame has none,
+    or None. ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame. ``covariance`` (N, 3,
     3) m^2 of the centre, ``normal_sigma`` (N,) rad an axis. ``slide`` (N, 3) m in the camera frame, or None: how a
     centre moves if the edges found lie one noise of the face below it (a rough face hides where its chamfer begins).
     """

@@ -25,7 +25,7 @@ class Synchronised:
     """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found.
 
     ``clock`` of the frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation,
-    both None where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames;
+    both None where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames.
     ``source`` is "recording" or "calibration".
     """
 

@@ -28,8 +28,8 @@ _STEEPEST_RAD = float(np.radians(60.0))
 class VisibleVolume:
     """Visible volume.
 
-    ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data;
-    ``tilt_rad``: largest angle between the target's normal and the line of sight; ``source``: its description for
+    ``tan_x``, ``tan_y``: half field of view. ``near``, ``far``: along the optical axis, in the unit of the data.
+    ``tilt_rad``: largest angle between the target's normal and the line of sight. ``source``: its description for
     messages.
     """
 
@@ -149,7 +149,7 @@ def next_pose(
     The target is turned by 20, 40 or 60 degrees, and seen there or elsewhere.
 
     Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for
-    it within its limits; where none is named, or where it does not even reach the poses so far (another base or tool
+    it within its limits. Where none is named, or where it does not even reach the poses so far (another base or tool
     frame), the flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the
     target before the camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans
     with the arm's bodies too.

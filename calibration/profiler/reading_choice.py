@@ -70,7 +70,7 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
     """Number of the reading under which the profiles show one target, and a sentence about it.
 
     If a reading were right, its residual would exceed that of the best by more than the root of the quantile of F(dof,
-    dof) with probability CHANCE at most; readings beyond it are rejected.
+    dof) with probability CHANCE at most. Readings beyond it are rejected.
 
     Args:
         readings: the candidates, the usual one first.

@@ -379,8 +379,8 @@ def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST
 class Algorithm1State:
     """State of Algorithm 1 after k new scans; immutable, each step returns the next one.
 
-    ``pool``: up to four pairs; ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
-    until a registration succeeds; ``history`` has one (scans used, cost) entry per scan from the fourth on.
+    ``pool``: up to four pairs. ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
+    until a registration succeeds. ``history`` has one (scans used, cost) entry per scan from the fourth on.
     """
 
     e_required: float

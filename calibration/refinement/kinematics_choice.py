@@ -175,7 +175,7 @@ def choose_kinematics(
 
     The fit starts from the observations' plain estimate.
 
-    In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if
+    In ten folds both calibrations, choices included, are repeated without the held-out poses. The errors are applied if
     the mean falls by 5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The
     prior is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
 

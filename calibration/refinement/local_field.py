@@ -47,7 +47,7 @@ class LocalField:
     Residuals (n, 3) m are in the base, at ``places`` (n, 3) m and ``turns`` (n, 3, 3).
 
     The covariance of the field at two poses is ``sigma_field_m``^2 exp(-d^2 / 2 ``length_m``^2 - a^2 / 2
-    ``turn_rad``^2) for each axis, d their distance and a the angle between them; every scan has ``sigma_scan_m`` (per
+    ``turn_rad``^2) for each axis, d their distance and a the angle between them. Every scan has ``sigma_scan_m`` (per
     axis) of its own. Far from all poses, or at another orientation, the field is zero and its spread is
     ``sigma_field_m``. Source: Rasmussen and Williams 2006, 2.2 and 5.4.1.
     """

@@ -34,8 +34,8 @@ class ClosedForm:
 class LinearFit:
     """Six-parameter calibration: hand = [a x - b y + t_x + x_p C - y_p S, -b x - a y + t_y - x_p S - y_p C].
 
-    x, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p, all m;
-    ``covariance`` (6, 6) m^2 from the residuals; ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted minus
+    x, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p, all m.
+    ``covariance`` (6, 6) m^2 from the residuals. ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted minus
     measured, the second by a fit that never saw that landmark. ``scale``: fitted over measured depth (1 for a perfect
     depth camera). ``condition``: of the column-scaled design.
     """
@@ -147,7 +147,7 @@ class PlanarFit:
     """Calibration by the tablet's own size: hand = scale M(phi) p + t + pen(theta), M = [[c, s], [s, -c]].
 
     p: point of the tablet (m) that a pixel shows by ``X_CT``. ``parameters`` (6,) = phi (rad), t_x, t_y, x_p, y_p (m),
-    scale (1 unless it was freed); ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale;
+    scale (1 unless it was freed). ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale.
     ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted from the image minus measured, the second by a fit
     that saw that landmark neither touched nor in the image. ``free_scale``: (value, standard deviation) of a scale that
     the touches alone would like, a check of the tablet's pixels per inch.
@@ -190,7 +190,7 @@ def hand_over(parameters: Array, points_m: Array, theta_rad: Array) -> Array:
 def fit_plane_motion(points_m: Array, hand_m: Array, theta_rad: Array, free_scale: bool = False) -> Array:
     """Parameters (6,) minimising the squared differences of hand_over to ``hand_m`` (n, 2) m.
 
-    Translation and pen are linear and projected out; what remains is a quadratic in scale (cos phi, sin phi): solved as
+    Translation and pen are linear and projected out. What remains is a quadratic in scale (cos phi, sin phi): solved as
     it is with a free scale, else on the unit circle by Newton's method in phi.
     """
     n = len(points_m)

@@ -16,7 +16,7 @@ def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:
     """X_CT of the tablet (x right, y down the screen, z into it) from rays (n, 2) of its landmarks (n, 2) m.
 
     Starts are OpenCV's IPPE (a plane's two poses) and SQPnP (also where three of four landmarks lie on a line, which
-    leaves no homography); each is refined by Levenberg-Marquardt, and the one with the smallest reprojection error in
+    leaves no homography). Each is refined by Levenberg-Marquardt, and the one with the smallest reprojection error in
     front of the camera is taken. Raises TooFewLandmarks, CollinearLandmarks, and LandmarksNotFound where no pose
     explains the rays.
     """

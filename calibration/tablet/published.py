@@ -89,7 +89,7 @@ def place_landmarks(
 
     HTM: Eqs. 1-11. DH: Eqs. 12-16, with the camera's and the tablet's translation (a, 0) as in modified DH.
     ``dh_offset_in_error``: Eq. 20 of the DH chain as the published figures have it, with the tablet's translation added
-    to a difference of points (homogeneous 1 in place of 0); False restores the 0. It changes nothing for HTM.
+    to a difference of points (homogeneous 1 in place of 0). False restores the 0. It changes nothing for HTM.
     """
     v = np.atleast_2d(parameters).T[:, :, None]
     zero = np.zeros_like(v[0])

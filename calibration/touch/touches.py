@@ -35,7 +35,7 @@ class Touch:
 
     ``X_BF``: flange pose by the robot; ``p_FT`` (3,) m: centre of the tip's ball on the flange, ``radius`` m of that
     ball (0: a point). ``p_C`` (3,) m as the scanner gave it, not corrected: the point, a point of the plane or edge, or
-    the sphere's centre; ``direction_C`` (3,): outward normal of a plane, direction of an edge, else None;
+    the sphere's centre. ``direction_C`` (3,): outward normal of a plane, direction of an edge, else None.
     ``feature_radius`` m of a sphere. ``q`` (n,) rad where known.
     """
 

@@ -141,7 +141,7 @@ def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
 def chain_inverse(chain: Chain, X_BF: RigidTransform, near: ArrayLike | None = None, *, seed: int = 0) -> Array | None:
     """Joint angles (n,) rad within the limits that put the flange at X_BF, or None where none was found.
 
-    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits; an arm
+    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits. An arm
     with more than six joints has whole families of answers, of which this is one. None is no proof that there is none:
     the closed form of inverse.inverse_kinematics is, for Universal Robots' arms. Raises InputError where X_BF is not
     finite.

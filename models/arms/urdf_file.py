@@ -39,7 +39,7 @@ class UrdfChain(NamedTuple):
 def read_urdf_chain(path: Path) -> UrdfChain:
     """The chain of a URDF file; meshes are not needed.
 
-    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root; the flange is `tool0`
+    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root. The flange is `tool0`
     or `flange` (z out of it), else the last link.
 
     Raises:

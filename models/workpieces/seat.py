@@ -163,7 +163,7 @@ def press_for(
 ) -> Press:
     """Return how deep the tip is pressed into this joint, m; a given value is used as it is.
 
-    Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall; half of that is
+    Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall. Half of that is
     taken, at most 2 mm, and in wide joints the downward press is increased.
 
     Raises:
@@ -197,7 +197,7 @@ def seat(section: JointSection, tip: SeatedTip, press: Press) -> Seated:
     """Where the ball of the tip rests, pressed left and down by its springs.
 
     The pressure in the soft ball grows linearly from its surface to the modulus at its centre (Elandt et al., IROS
-    2019); each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
+    2019). Each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
 
     Raises:
         JointNotWeldable: no such place: the ball climbs out.
@@ -223,7 +223,7 @@ def face_forces(centre: Floats, segments: Floats, normals: Floats, radius_m: flo
     """Force (2,) N of rigid faces (M,2,2), long along the seam, on a soft ball at a point (2,) of the cut.
 
     A strip of a face at distance p from the centre meets the ball over 2 l, l^2 = r^2 - p^2, with the pressure
-    E (1 - sqrt(p^2 + z^2) / r); its integral over z is E (l - p^2 asinh(l / p) / r).
+    E (1 - sqrt(p^2 + z^2) / r). Its integral over z is E (l - p^2 asinh(l / p) / r).
     """
     a, d = segments[:, 0] - centre, segments[:, 1] - segments[:, 0]
     length = np.linalg.norm(d, axis=1)

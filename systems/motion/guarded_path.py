@@ -36,7 +36,7 @@ class SingularityGuard(LeafSystem):
         - velocity
         - margin
 
-    `V_BT` (6) [omega rad/s; v m/s] in B; `guarded` (8) is both of the following; `velocity` (6) rad/s; `margin` (2):
+    `V_BT` (6) [omega rad/s; v m/s] in B. `guarded` (8) is both of the following. `velocity` (6) rad/s. `margin` (2):
     least singular value of the length-scaled Jacobian, and 1.0 while the arm is stopped. The seam's own singularity
     (n_d . n_t -> 0) is guarded inside the servo.
     """

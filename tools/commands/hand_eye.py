@@ -225,8 +225,8 @@ def run_hand_eye(
     Writes report.html besides the exports.
 
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the
-    scanner, for the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and
-    robot errors is applied: the robot's errors are sought in the poses that the corners left); ``kinematics``: file of
+    scanner, for the next pose. ``refine``: "joints" or "links", errors of that robot to look for (one of corners and
+    robot errors is applied: the robot's errors are sought in the poses that the corners left). ``kinematics``: file of
     that robot's own kinematics, whose poses at the joint angles replace the stated ones. ``limit_mm`` is the held-out
     error at the target, 95 %, that the job allows. ``board``: the board in the pictures of the folder ``file``, see
     ``parse_board``; ``intrinsics``: the file that states their camera.

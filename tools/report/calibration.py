@@ -110,8 +110,8 @@ class Algorithm1Outcome:
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder.
 
-    ``observations`` include the scanner correction where one was accepted; ``notes`` say in which form the dataset was
-    read; ``clouds`` are each scan's points (N, 3) m of C about its flange; ``limit_mm`` is the error that the job
+    ``observations`` include the scanner correction where one was accepted. ``notes`` say in which form the dataset was
+    read. ``clouds`` are each scan's points (N, 3) m of C about its flange. ``limit_mm`` is the error that the job
     allows (None: not stated).
     """
 

@@ -235,7 +235,7 @@ def decide(found: Findings) -> tuple[str, str]:
 class FirstScreen:
     """The first screen.
 
-    `lead` is said before the verdict's reason; `more` are rows by name: other results, and what takes the place of a
+    `lead` is said before the verdict's reason. `more` are rows by name: other results, and what takes the place of a
     pose or a figure that the command does not have.
     """
 

@@ -42,7 +42,7 @@ class PairedPoses:
     """Pairs of one cell.
 
     ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4) and
-    ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``.
+    ``Y`` (4, 4) the truth, which no solver is given. F X G = Y but for the errors of this ``kind``.
     """
 
     kind: str
@@ -191,7 +191,7 @@ class SolverVerdict:
     """Hold the solver's answer on a world.
 
     "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or "NAN" and "WRONG", which must
-    not be; ``nees``: of the answer, in units of the region that holds the truth.
+    not be. ``nees``: of the answer, in units of the region that holds the truth.
     """
 
     said: str

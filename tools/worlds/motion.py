@@ -166,10 +166,10 @@ _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers
 class MotionOptions:
     """What is simulated. Lengths m, times s; ``size`` (width, height) resizes the scanner's image.
 
-    ``stream_columns`` is "joints" or "pose"; ``stream_jitter_s`` the standard deviation of a row's time about its
-    instant; ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside
-    it); ``device_clock`` False leaves out the device's stamps; ``mount_mm`` and ``mount_deg`` are how far the scanner's
-    true pose is off the nominal one; ``stop_and_go`` lets the arm rest for that time at each corner; ``surroundings``
+    ``stream_columns`` is "joints" or "pose". ``stream_jitter_s`` the standard deviation of a row's time about its
+    instant. ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside
+    it). ``device_clock`` False leaves out the device's stamps. ``mount_mm`` and ``mount_deg`` are how far the scanner's
+    true pose is off the nominal one. ``stop_and_go`` lets the arm rest for that time at each corner. ``surroundings``
     False leaves out the table and the blocks on it, which makes the files three times smaller.
     """
 

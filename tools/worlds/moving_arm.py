@@ -283,7 +283,7 @@ class MovingScene:
         """The depth map (H, W) m of one frame, 0 where nothing was measured.
 
         ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle
-        row; ``samples`` times of the exposure are mixed; ``scanner`` has the errors of this frame (the preset's);
+        row. ``samples`` times of the exposure are mixed. ``scanner`` has the errors of this frame (the preset's).
         ``X_BW`` is the pose in the base of what stands still (identity).
         """
         device = self.scanner if scanner is None else scanner

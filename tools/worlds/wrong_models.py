@@ -222,7 +222,7 @@ def station(
 ) -> WrongArmStation:
     """Draw a UR10e with wrong joints and axes, and a distorting scanner 0.65 m from its flange.
 
-    Joint offsets of 0.02 to 0.05 degrees, axes off by 0.1 to 0.3 mm and 0.02 degrees; the scanner has a scale error of
+    Joint offsets of 0.02 to 0.05 degrees, axes off by 0.1 to 0.3 mm and 0.02 degrees. The scanner has a scale error of
     0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the correction's polynomial has only in part.
 
     ``planned``: the scans are those of 250 candidates that tell most (informative_poses); the new ones are random.

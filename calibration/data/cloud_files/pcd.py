@@ -55,7 +55,7 @@ def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
 
     VIEWPOINT is the pose of the sensor when it took the scan. PCL's documentation does not state the frame of the
     points, and programs differ: PCL's viewer and `transform_from_viewpoint` apply VIEWPOINT to points in the sensor's
-    frame; PCL's estimation of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT
+    frame. PCL's estimation of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT
     other than identity is refused until ``form.viewpoint`` says which: ``sensor`` (it is not applied) or ``world`` (it
     is undone).
 

@@ -119,7 +119,7 @@ def judge_pose(
     the covariance C of the new solution (plus the stated one). If the stated pose is right, e' C^-1 e / 6 has the
     distribution F(6, degrees of freedom): for a linear problem it is the F test of the six more unknowns. The pairs
     show an error of six numbers with the probability POWER where its non-centrality is that of the non-central F
-    distribution; the longest displacement of the target with this non-centrality is ``shown_mm``.
+    distribution. The longest displacement of the target with this non-centrality is ``shown_mm``.
 
     Args:
         problem: full poses, X and Y free.

@@ -93,7 +93,7 @@ class FilterConfig:
     """What is known before.
 
     The sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander in a cell in
-    which nothing happens; ``change`` (SIZE,) is how large a change may be.
+    which nothing happens. ``change`` (SIZE,) is how large a change may be.
     """
 
     clock_s: float = 5e-3

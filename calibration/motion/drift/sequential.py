@@ -39,8 +39,8 @@ class DriftConfig:
     """Settings of the test. ``false_alarms_per_hour`` bounds the alarms in a cell in which nothing happens.
 
     ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of
-    frames averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a
-    change that is as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not
+    frames averages away. ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a
+    change that is as old as the first frame. It is tested for ``stated_s``. Changes older than ``longest_s`` are not
     tested. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up
     explains a slow change as well. The noise is that of the last ``noise_frames``, and no less than the mean of the
     last ``noise_memory``. Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not

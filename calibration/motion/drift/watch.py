@@ -125,8 +125,8 @@ def _normals(p: Array) -> tuple[Array, Mask]:
 class DriftHistory:
     """What a recording says of a calibration, for its N tracked frames in the order of their times.
 
-    ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and
-    ``tilts`` (N, 2) rad those after each frame's own time is taken out as far as the jitter allows; ``offsets`` (N,) s
+    ``rows`` are the residuals against the calibration at the nominal capture times. ``residuals`` (N, 3) m and
+    ``tilts`` (N, 2) rad those after each frame's own time is taken out as far as the jitter allows. ``offsets`` (N,) s
     is by how much each frame was later than nominal. ``before`` (N, 3) m are the residuals of frames taken for as old
     as their arrival, ``after`` (N, 3) m those against the pose that held at the time. ``gross`` (N,) frames show
     something else. ``statistic`` (N,) is the drift test's largest, over ``threshold``. ``X_BC`` and ``covariance`` (6,

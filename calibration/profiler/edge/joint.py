@@ -1,7 +1,7 @@
 """Estimate X_FS from one straight edge in any poses: starts from 24 orientations, then one least-squares problem.
 
 Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor
-and robot), with a Cauchy loss that keeps 95 % of what least squares would get; the covariance is the Cramer-Rao bound
+and robot), with a Cauchy loss that keeps 95 % of what least squares would get. The covariance is the Cramer-Rao bound
 over that share, where the stated sigmas are right.
 
 The starts minimise the distance of a point to a line: it has no division by the angle between edge and scan plane, so

@@ -83,7 +83,7 @@ class _Line:
 
     Its coefficients (k,) and their covariance, and the sigma of a sample across it.
 
-    Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may
+    Straight where the samples show no bend. `unseen` are then the squares (m) that coefficients of higher powers may
     still have, each with what of its power (m, 4) the polynomial leaves.
     """
 

@@ -117,8 +117,8 @@ class ParameterLayout:
 class _Points(NamedTuple):
     """Where the unknowns `x`, with the turn `R0` before them, place everything.
 
-    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m,
-    3, 3): of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by
+    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches. `rotation` (m,
+    3, 3): of the flange at each point. `R`: of the sensor. `turned` (m, 3): the points about the sensor's origin, by
     F's axes.
     """
 

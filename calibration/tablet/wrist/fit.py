@@ -26,8 +26,8 @@ _TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by ze
 class WristTouches:
     """Touches and images of one visit, SI units.
 
-    ``X_BF`` flange in the base at each of n touches; ``touched_m`` and ``landmark_m`` (n, 2) on the tablet; ``views``:
-    for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks; ``focal_px`` of the camera
+    ``X_BF`` flange in the base at each of n touches. ``touched_m`` and ``landmark_m`` (n, 2) on the tablet. ``views``:
+    for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks. ``focal_px`` of the camera
     (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP
     then means: however the pen leans, the centre stands that far above the point it touches.
     """

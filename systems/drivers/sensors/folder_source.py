@@ -156,7 +156,7 @@ UNFINISHED = (".tmp", ".part", ".partial", ".crdownload")
 class NewFiles:
     """Files of some suffixes that appear in a folder, or change, after `start`.
 
-    A file is complete when its size and time of change have been the same for `settle_s`; one that was renamed into the
+    A file is complete when its size and time of change have been the same for `settle_s`. One that was renamed into the
     folder and last changed before that is complete at once, unless the computer's clock was set since `start`. Names
     that begin with a dot or end as unfinished downloads do are never looked at. The folder is polled: network folders
     do not report changes.

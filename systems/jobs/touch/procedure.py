@@ -94,9 +94,9 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         - descent
         - streaming
 
-    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends;
-    `descent` (6) rad/s moves the tip against the face's normal, zero otherwise; `trigger` (1) and `streaming` (1) go to
-    the station; `hold` (1) is the operator's stop request.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends.
+    `descent` (6) rad/s moves the tip against the face's normal, zero otherwise. `trigger` (1) and `streaming` (1) go to
+    the station. `hold` (1) is the operator's stop request.
     """
 
     inputs = TouchInputs

@@ -184,7 +184,7 @@ def emulator_process(
 ) -> Iterator[Emulator]:
     """An emulator that listens, under the lock that keeps its address's ports for one owner at a time.
 
-    The child ends with the block, and with this process (`--parent`) where that is killed; it has a session of its own,
+    The child ends with the block, and with this process (`--parent`) where that is killed. It has a session of its own,
     so that Ctrl-C reaches its user and not the controller.
 
     Args:

@@ -70,7 +70,7 @@ def center_bound(points_C: Array, fit: FlangeFit, parts: int) -> float:
     """Least rms distance (m) between the centres from two of ``parts`` random parts of a cloud, in the face's plane.
 
     Information of one edge about a coordinate of its centre: density x circumference x 0.90 / blur / 2, Poisson points,
-    radius free (a full circle's centre does not depend on it); both edges add.
+    radius free (a full circle's centre does not depend on it). Both edges add.
     """
     information = 0.0
     for outer, radius in ((True, fit.outer_radius_m), (False, fit.bore_radius_m)):

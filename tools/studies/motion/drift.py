@@ -32,7 +32,7 @@ class DriftTrial:
 
     ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of
     the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
-    threshold; ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
+    threshold. ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
     change was, in the same units.
     """
 

@@ -63,7 +63,7 @@ class Missed(NamedTuple):
 class StreamReport:
     """One stream.
 
-    `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself,
+    `fault` is empty where it went through to its end. `stops`: when in the run (s) the link stopped the arm by itself,
     and its reason, lived through with a new start.
     """
 

@@ -109,8 +109,8 @@ class TipPlace:
     def step(self, rest: Array, dt: float) -> Array:
         """Move for dt s towards balance with the spring's rest point (3,) m; the centre (3,) m.
 
-        Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge;
-        across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
+        Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge.
+        Across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
         """
         groove, line, wedge = self._groove, self._groove.line, self._wedge
         r0, r1, r2 = rest.tolist()

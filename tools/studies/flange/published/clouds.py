@@ -98,7 +98,7 @@ class CloudsOutcome:
     """A folder of scans.
 
     ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the verification, at the
-    camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
+    camera (roll, pitch, yaw, x, y, z) and at the flange. ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
     ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step.
     """
 

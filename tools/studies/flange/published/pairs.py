@@ -50,7 +50,7 @@ class PairsOutcome:
     """One robot of which centre pairs are known. Errors in m at the flange centre, gross outliers (named) not scored.
 
     ``table1`` (6,): roll, pitch, yaw (rad), x, y, z (m) of the all-pairs H against the implied one, None without stored
-    runs; ``own_pool`` errors on the four pairs each run kept, ``true`` on all others; ``svd`` and ``ours`` held out in
+    runs. ``own_pool`` errors on the four pairs each run kept, ``true`` on all others. ``svd`` and ``ours`` held out in
     5 folds.
     """
 
@@ -166,7 +166,7 @@ class KinectOutcome:
     """Errors (m) at the wrist ring.
 
     ``residual`` of the all-pairs SVD, ``held_out`` of it and ``ours`` of the robust fit in 5 folds, ``compensated``
-    of H e with the paper's own e (Eq. (21)); ``shift_m`` how far that e moves the middle of the workspace, and
+    of H e with the paper's own e (Eq. (21)). ``shift_m`` how far that e moves the middle of the workspace, and
     ``at_camera_m`` its translation, taken at the camera.
     """
 

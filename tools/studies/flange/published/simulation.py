@@ -41,7 +41,7 @@ COSTS = {
 class Errors:
     """Errors of K calibrations.
 
-    ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes them; ``at_tcp`` (K,
+    ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes them. ``at_tcp`` (K,
     75) m, how far each flange centre is put from where it is.
     """
 
