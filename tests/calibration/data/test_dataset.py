@@ -121,7 +121,7 @@ def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
             "dataset.yaml",
             "eye_on_base",
             "eye_in_hand",
-            "an arm carries \\(eye_in_hand\\); only 'weldcal calibrate' reads it",
+            "on an arm \\(eye_in_hand\\)",
         ),
         ("dataset.yaml", "robot: ur10e", "robots: ur10e", "has no key 'robots'; did you mean 'robot'"),
         ("poses.csv", "0.5,0.2,0.4", "0.5,,0.4", "'' in column y of 'b'; a number is needed"),
