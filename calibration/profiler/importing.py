@@ -230,10 +230,9 @@ def _no_poses(found: Profiles) -> str:
     columns = f" Its columns are {listed_columns(found)}." if found.columns else ""
     kind = f" ({found.form})" if found.form else ""
     return (
-        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Write the"
-        " flange's pose of each profile into a file poses.csv beside it, a row each, with the columns"
-        " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA), or name such a file with --poses"
-        " FILE."
+        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Add a"
+        " file poses.csv beside it, or name one with --poses FILE. It has one row for the flange's pose at each profile:"
+        " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA)."
     )
 
 

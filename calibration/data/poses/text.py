@@ -60,8 +60,8 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
     require_short_numbers(text, name)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
-            f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length."
-            " Write the inverse poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
+            f"'{name}' is COLMAP's images.txt, whose poses are inverted (world in camera) and have no unit of length."
+            " Invert them, scale them to metres by a known length, and write them as a table x,y,z,qw,qx,qy,qz."
         )
     found = list_of_program(text, name)
     return [found] if found is not None else _keyed(text, name) or _numbers(text, name)

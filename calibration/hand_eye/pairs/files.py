@@ -238,8 +238,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         lists = lists_of_tree(tree, path.name)
         if len(lists) == 1 and len(lists[0]) == 1:
             raise DatasetError(
-                f"'{path.name}' holds one pose: it looks like the result of a calibration, and samples are needed. Give"
-                " the file of the samples, or judge this result on them with 'weldcal verify'."
+                f"'{path.name}' has only one pose, so it seems to be the result of a calibration. Give the file of the"
+                " samples instead. To test this result on the samples, use 'weldcal verify'."
             )
         return lists, raw
     lists = read_lists(path)

@@ -196,8 +196,8 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
     X = reading.X
     if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
         raise InconsistentPoses(
-            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}': it does not change while the other"
-            " list does. Check that each sample stores the present pose."
+            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}', but the other list changes. Check"
+            f" that each sample stores the pose that the {who} has at that moment."
         )
 
 
