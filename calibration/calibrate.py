@@ -130,7 +130,7 @@ def calibrate(
 
 
 def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Calibration:
-    """A calibration without a refinement, refined as ``steps`` say.
+    """Return a calibration without a refinement, refined as ``steps`` say.
 
     ``observations`` (n) are those it was made from, as measured.
 

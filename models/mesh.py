@@ -155,7 +155,7 @@ class TriMesh:
         return f"{v}\n{vn}\n{f}\n"
 
     def to_drake(self, hint: str) -> Mesh:
-        """The mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
+        """Return the mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
         from pydrake.geometry import InMemoryMesh, Mesh
 
         return Mesh(InMemoryMesh(mesh_file=MemoryFile(self.to_obj(), ".obj", hint)))
@@ -237,7 +237,7 @@ def _triangulated(outlines: tuple[bytes, ...]) -> Ints:
 
 
 def plane_mesh(points: Floats, triangles: Ints, z_m: float, up: bool) -> TriMesh:
-    """A flat face (points (N,2)) at height z, facing +z when `up`, else -z."""
+    """Return a flat face (points (N,2)) at height z, facing +z when `up`, else -z."""
     return TriMesh(np.column_stack([points, np.full(len(points), z_m)]), triangles if up else triangles[:, ::-1])
 
 

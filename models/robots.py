@@ -30,7 +30,7 @@ _FEET = {"ur10e": (0.190, 0.166, 0.014)}
 
 
 def base_circle(arm: str) -> BaseCircle:
-    """The base-mounting circle of that arm (flange paper, Fig. 14a).
+    """Return the base-mounting circle of that arm (flange paper, Fig. 14a).
 
     Raises InputError naming the arms whose foot is known.
     """
@@ -140,7 +140,7 @@ def _ur(
 
 
 def _franka(name: str, title: str, **sources: str) -> Robot:
-    """A Franka arm. The maker's meshes disagree on the dowel hole (hand.dae: +x, link7.dae: +y)."""
+    """Return a Franka arm. The maker's meshes disagree on the dowel hole (hand.dae: +x, link7.dae: +y)."""
     return Robot(
         name=name,
         title=title,

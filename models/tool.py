@@ -63,7 +63,7 @@ class Seat(NamedTuple):
 
 
 def flipped_where_it_is(X: RigidTransform) -> RigidTransform:
-    """The pose with R_FLIPPED as its rotation where it differs from that by rounding only."""
+    """Return the pose with R_FLIPPED as its rotation where it differs from that by rounding only."""
     same = np.abs(X.rotation().matrix() - R_FLIPPED.matrix()).max() < 1e-12
     return RigidTransform(R_FLIPPED, X.translation()) if same else X
 
@@ -219,7 +219,7 @@ class WeldingTool:
         return straight if X_TM.IsNearlyEqualTo(straight, 1e-12) else X_TM
 
     def drawn(self) -> tuple[ToolShape, ...]:
-        """The bodies on the flange, besides ring, finger and tag.
+        """Return the bodies on the flange, besides ring, finger and tag.
 
         Those of the tool's file, or those of the welding tool.
         """

@@ -205,7 +205,7 @@ class BackgroundSystem(LeafSystem):
         raise NotImplementedError
 
     def newest(self, context: Context) -> Any:
-        """The present output in this system's context."""
+        """Return the present output in this system's context."""
         return context.get_abstract_state(self._work).get_value().newest
 
     def _update(self, context: Context, state: State) -> None:

@@ -66,7 +66,7 @@ class CameraFile:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """The camera of a file.
+    """Return the camera of a file.
 
     Raises:
         DatasetError: the file cannot be read, states no camera, or a lens model that OpenCV's pinhole model does not
@@ -95,7 +95,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def find_camera(path: Path) -> CameraFile | None:
-    """The camera of a file as it is stated, not checked; None where it states none.
+    """Return the camera of a file as it is stated, not checked; None where it states none.
 
     Raises InputError where it cannot be read.
     """

@@ -87,7 +87,7 @@ class Dataset(Recorded):
     one first."""
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
-        """The dataset with its poses in another of its readings."""
+        """Return the dataset with its poses in another of its readings."""
         poses = {id: as_transform(X) for id, X in zip(self.poses, reading.X, strict=True)}
         others = tuple(one for one in self.readings if one.form != reading.form)
         return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
@@ -234,7 +234,7 @@ def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None
 
 
 def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
-    """The source of poses that dataset.yaml names; None where it is a ROS recording."""
+    """Return the source of poses that dataset.yaml names; None where it is a ROS recording."""
     path = folder / name
     if not path.exists():
         raise DatasetError(
@@ -246,7 +246,7 @@ def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
 
 
 def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Dataset:
-    """A dataset in this package's own form: poses.csv with quaternions, and clouds/."""
+    """Return a dataset in this package's own form: poses.csv with quaternions, and clouds/."""
     hashes["poses.csv"] = digest(folder / "poses.csv")
     poses = _poses(folder / "poses.csv", header.units.poses)
     clouds, refused = _match(folder / "clouds", poses)
@@ -256,7 +256,7 @@ def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Datas
 def _recognised(
     folder: Path, header: DatasetHeader, source: Path | tuple[Path, ...], hashes: dict[str, str]
 ) -> Dataset:
-    """A dataset whose poses are in another form."""
+    """Return a dataset whose poses are in another form."""
     form = header.poses or PoseForm()
     found = read_poses(source, form)
     X, unit = metric_poses(found, header.units.poses, form)
@@ -277,7 +277,7 @@ def _recognised(
 
 
 def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:
-    """A dataset from a ROS recording; its clouds stay in memory."""
+    """Return a dataset from a ROS recording; its clouds stay in memory."""
     form = header.poses or PoseForm()
     found = read_bag(bag, form, robot or header.robot)
     listed = PoseList(source=bag.name, X=found.X, ids=found.ids, times=found.times, unit="m", read_as="a ROS recording")
@@ -312,7 +312,7 @@ def _finished(
     hashes: dict[str, str],
     notes: tuple[str, ...],
 ) -> Dataset:
-    """The dataset without unreadable clouds and scans that repeat another one."""
+    """Return the dataset without unreadable clouds and scans that repeat another one."""
     content, unreadable = _contents(clouds)
     clouds = {id: cloud for id, cloud in clouds.items() if id in content}
     refused += unreadable

@@ -113,5 +113,5 @@ class DatasetHeader:
 
 
 def without_cloud_form(header: DatasetHeader) -> dict[str, Any]:
-    """The header as a document of plain values for clouds that are written in metres, in the sensor's frame."""
+    """Return the header as a document of plain values for clouds that are written in metres, in the sensor's frame."""
     return {k: v for k, v in asdict(header).items() if k not in ("intrinsics", "depth_scale", "viewpoint")}

@@ -137,7 +137,7 @@ def matrix4(X: RigidTransform) -> list[list[float]]:
 
 
 def pose_document(X: RigidTransform) -> dict[str, Any]:
-    """A pose as plain values: its matrix, position (m) and quaternion."""
+    """Return a pose as plain values: its matrix, position (m) and quaternion."""
     q = X.rotation().ToQuaternion().wxyz()
     return {"matrix": matrix4(X), "xyz": [float(v) for v in X.translation()], "wxyz": [float(v) for v in q]}
 
@@ -201,7 +201,7 @@ def _matrix(order: str, C: Array | None) -> dict[str, Any] | None:
 
 
 def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
-    """A fixed target's centre (m) and normal in the base as plain values."""
+    """Return a fixed target's centre (m) and normal in the base as plain values."""
     return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
 
 
@@ -288,7 +288,7 @@ def load_result(path: Path) -> CalibrationResult:
 
 
 def _covariance(d: DocumentSection, key: str, size: int) -> Array:
-    """The matrix (size, size) of a covariance.
+    """Return the matrix (size, size) of a covariance.
 
     Raises InputError where it is not symmetric or has a negative variance.
     """
@@ -341,7 +341,7 @@ def _only(r: DocumentSection, kind: type) -> None:
 def export_urdf(
     X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame", note: str | None = None
 ) -> str:
-    """A xacro file for `xacro:include` into a robot that has the parent link.
+    """Return a xacro file for `xacro:include` into a robot that has the parent link.
 
     The child link on a fixed joint, one root element.
     """
@@ -359,7 +359,7 @@ def export_urdf(
 
 
 def export_ros2(X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame") -> str:
-    """The command line of ROS 2's static transform publisher."""
+    """Return the command line of ROS 2's static transform publisher."""
     x, y, z = X_BC.translation()
     qw, qx, qy, qz = _wxyz(X_BC)
     return (
@@ -369,7 +369,7 @@ def export_ros2(X_BC: RigidTransform, parent: str = "base", child: str = "scanne
 
 
 def export_ur_pose(X_BC: RigidTransform) -> str:
-    """A URScript pose: position m and rotation vector rad."""
+    """Return a URScript pose: position m and rotation vector rad."""
     return "p[" + ", ".join(f"{v:.9f}" for v in (*X_BC.translation(), *rotation_vector(X_BC.rotation()))) + "]\n"
 
 
@@ -406,7 +406,7 @@ def correction_note(result: CalibrationResult, file: Path | str | None = None) -
 
 
 def result_parent(result: CalibrationResult) -> str:
-    """The frame, as ROS calls it, that the scanner is fixed in."""
+    """Return the frame, as ROS calls it, that the scanner is fixed in."""
     return "base" if result.configuration == ON_BASE else "tool0"
 
 

@@ -55,7 +55,7 @@ class ScannerClock:
 
 
 def clock_from_document(value: Any, file: str) -> ScannerClock | None:
-    """The clock of a calibration.yaml; None without one. Raises InputError naming the key."""
+    """Return the clock of a calibration.yaml; None without one. Raises InputError naming the key."""
     if value is None:
         return None
     if not isinstance(value, Mapping) or value.get("kind") not in (ARRIVAL, DEVICE):

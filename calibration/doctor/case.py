@@ -102,7 +102,7 @@ class DoctorCase:
         return np.asarray((t - t.min()) / span if span > 0.0 else np.linspace(0.0, 1.0, self.n))
 
     def with_poses(self, X_BF: Array) -> Self:
-        """The same scans with other robot poses, to which no errors of the arm are known."""
+        """Return the same scans with other robot poses, to which no errors of the arm are known."""
         return replace(self, X_BF=X_BF, arm=None)
 
     def pick(self, which: Which) -> Self:
@@ -139,7 +139,7 @@ def case_of(
     fits_flange: str = "",
     near_far: tuple[float, float] | None = None,
 ) -> DoctorCase:
-    """The case of observations in their order; X_FR (4, 4) is the feature in the flange."""
+    """Return the case of observations in their order; X_FR (4, 4) is the feature in the flange."""
     nan = np.full(3, np.nan)
     X_BR = np.array([o.X_BR.GetAsMatrix4() for o in observations]).reshape(-1, 4, 4)
     return DoctorCase(
@@ -195,7 +195,7 @@ def _six(X: Array) -> list[str]:
 
 
 def read_case(path: Path) -> DoctorCase:
-    """The case of such a table. Raises InputError where it is damaged."""
+    """Return the case of such a table. Raises InputError where it is damaged."""
     names, rows = read_rows(path)
     if tuple(names) != _COLUMNS:
         raise InputError(f"'{path.name}' is no table of observations that 'weldcal calibrate' wrote.")

@@ -116,7 +116,7 @@ def looks_wrong(one: CauseFit) -> bool:
 
 
 def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
+    """Return the misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
 
     Else None.
     """
@@ -137,7 +137,7 @@ def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
 
 
 def mixed_units(case: DoctorCase) -> tuple[DoctorCase, float, tuple[str, ...]] | None:
-    """The case in one unit, the factor and the scans that were in another one; None where all are in one.
+    """Return the case in one unit, the factor and the scans that were in another one; None where all are in one.
 
     Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those
     within the reach of an arm are in metres. Else one factor between the spreads of both sides.
@@ -327,7 +327,7 @@ def _off(u: Array, z: Array) -> float:
 
 
 def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
+    """Return the figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
 
     None where both agree.
     """
@@ -397,7 +397,7 @@ class Diagnosis:
 
 
 def diagnose(case: DoctorCase) -> Diagnosis:
-    """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
+    """Return the causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
     if case.fits_flange and case.fits_flange != case.flange:
         causes.append(Cause("wrong flange size", 0.99, 1e8, {}, (), case.fits_flange))

@@ -99,7 +99,7 @@ def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
 
 
 def _direction(axis: Array) -> str:
-    """The base axis that a direction follows most, or the two that share it."""
+    """Return the base axis that a direction follows most, or the two that share it."""
     order = np.argsort(-np.abs(axis))
     names = "xyz"
     if abs(axis[order[0]]) > 0.9:

@@ -94,7 +94,7 @@ class ArmStart:
         )
 
     def agreement(self, X_BC: RigidTransform, p_B: Array) -> str:
-        """A sentence on how well a calibration agrees with the arm at points (n, 3) m of the base.
+        """Return a sentence on how well a calibration agrees with the arm at points (n, 3) m of the base.
 
         Raises:
             InconsistentPoses: it does not.
@@ -113,7 +113,7 @@ class ArmStart:
 def see_with_arm(
     data: Dataset, seen: FlangeObservations, standard: FlangeStandard, robot: str, *, seed: int = 0
 ) -> tuple[FlangeObservations, ArmStart | None]:
-    """The flanges of scans, looked for where the visible arm puts them.
+    """Return the flanges of scans, looked for where the visible arm puts them.
 
     As they were seen where the arm decides nothing.
     """
@@ -231,7 +231,7 @@ def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
 
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
-    """The capsules of an arm at joint angles (n,) rad."""
+    """Return the capsules of an arm at joint angles (n,) rad."""
     frames = [np.eye(4), *joint_frames(arm.stack, q)]
     if arm.name in known_arms():
         rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(load_arm(arm.name))]
@@ -440,7 +440,7 @@ def _likely(X: Array, views: Sequence[_View], most: int) -> Array:
 
 
 def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
-    """The pose that lays the scans' points best on the arm, and the allowance (m) on its radii."""
+    """Return the pose that lays the scans' points best on the arm, and the allowance (m) on its radii."""
     X, allowance = X.copy(), 0.0
     for scale in np.geomspace(0.08, _FINE_M, 16):
         H, g = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 20.0]), np.zeros(7)
@@ -472,7 +472,7 @@ def _verdict(X: Array, views: Sequence[_View], allowance: float) -> tuple[float,
 
 
 def _same(X: Array, Y: Array, views: Sequence[_View]) -> bool:
-    """Whether two poses put the arm's points to about the same place."""
+    """Return whether two poses put the arm's points to about the same place."""
     turn = float(angle_of(X[:3, :3].T @ Y[:3, :3]))
     middle = np.mean([view.points.mean(axis=0) for view in views], axis=0)
     far = float(np.linalg.norm((X[:3, :3] - Y[:3, :3]) @ middle + X[:3, 3] - Y[:3, 3]))

@@ -145,7 +145,7 @@ def _with_open_scanner(
     observations: Sequence[Observation],
     solve: Callable[[Sequence[Observation]], RigidTransform],
 ) -> CalibrationEstimate:
-    """The estimate with a covariance that holds what scanners are usually off: so few scans do not show it.
+    """Return the estimate with a covariance that holds what scanners are usually off: so few scans do not show it.
 
     Had the scanner needed the factors v, ``solve`` would have found X_BC moved by L v (derivative by differences).
     """

@@ -110,7 +110,7 @@ def fit_flanges(
 
 
 def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
-    """The dataset with its poses in the reading that the scans select."""
+    """Return the dataset with its poses in the reading that the scans select."""
     ids = list(data.poses)
     reading, text = choose_reading(
         data.readings,
@@ -123,7 +123,7 @@ def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
 
 
 def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
-    """An observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
+    """Return an observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
     return replace(
         o, p_CR=correction.points(o.p_CR), n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C)
     )
@@ -181,7 +181,7 @@ class ScanAgreement:
 def choose_reading(
     readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
-    """The reading of the flange poses with which the scans agree, and a sentence about it.
+    """Return the reading of the flange poses with which the scans agree, and a sentence about it.
 
     None where the usual one stands.
 

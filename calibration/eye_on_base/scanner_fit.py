@@ -173,7 +173,7 @@ def _gauss_newton(
     sigma_n: float,
     sigma_r: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float]:
-    """The loop of from_motion.
+    """Return the loop of from_motion.
 
     Pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
 

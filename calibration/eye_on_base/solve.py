@@ -210,7 +210,7 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
 
 
 def _minimal_sets(n: int, hypotheses: int, seed: int) -> NDArray[np.int64]:
-    """All triples of n poses (k, 3), or as many drawn ones as there are hypotheses."""
+    """Return all triples of n poses (k, 3), or as many drawn ones as there are hypotheses."""
     if n * (n - 1) * (n - 2) // 6 <= hypotheses:
         return np.array(list(itertools.combinations(range(n), 3)))
     return drawn_triples(n, hypotheses, seed)
@@ -222,7 +222,7 @@ def _squares(data: _Data, R: Array, t: Array) -> Array:
 
 
 def _trimmed(square: Array, h: int) -> Array:
-    """The sum (k,) over the h smallest of each row of `square` (k, n)."""
+    """Return the sum (k,) over the h smallest of each row of `square` (k, n)."""
     return np.asarray(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1))
 
 
@@ -331,7 +331,7 @@ def _gauss_newton(
     var_n: float,
     usual: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float, float]:
-    """The loop of _fit.
+    """Return the loop of _fit.
 
     Pose, information of all and of the positions, redundancies and variance components of both kinds.
 

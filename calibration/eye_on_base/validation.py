@@ -37,7 +37,7 @@ def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Ar
 
 
 def _plain(config: SolveConfig) -> Solve:
-    """The plain estimate, without a correction of the scanner, as a Solve."""
+    """Return the plain estimate, without a correction of the scanner, as a Solve."""
     config = replace(config, leave_one_out=False, hypotheses=150)
     return lambda observations: (estimate_eye_on_base(observations, config).X_BC, ScannerCorrection())
 

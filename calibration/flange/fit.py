@@ -119,7 +119,7 @@ def fit_flange(
 def _unordered(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A list of points.
+    """Return a list of points.
 
     On its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then searched.
     """
@@ -146,7 +146,7 @@ def _unordered(
 def _organised(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A scan with its pixel grid: the whole of it, or the window about a guess."""
+    """Return a scan with its pixel grid: the whole of it, or the window about a guess."""
     measured = None
     if is_thinned(cloud):
         measured = np.isfinite(cloud[..., 2])
@@ -200,7 +200,7 @@ def _where_it_was(
 
 
 def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal) -> FlangeFit | None:
-    """A cloud that shows little more than a flange as it is; a larger scene body by body."""
+    """Return a cloud that shows little more than a flange as it is; a larger scene body by body."""
     if len(points) == 0:
         refusal.note(0, "The cloud holds no valid point.")
         return None
@@ -381,13 +381,13 @@ def _basis(ray: Array, middle: Array) -> Array | None:
 
 
 def _same(d: Array, like: Array) -> Array:
-    """The median of those steps (N, 2) that equal one of them, or its reverse, within a fifth of its length."""
+    """Return the median of those steps (N, 2) that equal one of them, or its reverse, within a fifth of its length."""
     d = np.where((d @ like)[:, None] < 0.0, -d, d)
     return np.asarray(np.median(d[np.hypot(*(d - like).T) < 0.2 * np.hypot(*like)], axis=0))
 
 
 def _reduced(basis: Array) -> Array:
-    """The shortest basis of the same lattice (Lagrange)."""
+    """Return the shortest basis of the same lattice (Lagrange)."""
     a, b = basis
     for _ in range(10):
         if a @ a > b @ b:
@@ -444,7 +444,7 @@ def is_thinned(grid: Array) -> bool:
 
 
 def interpolated(grid: Array) -> Array:
-    """A thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
+    """Return a thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
 
     x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one goes on.
     Gaps longer than twice the common one stay.
@@ -484,7 +484,7 @@ def _along_rows(rays: Array) -> Array:
 
 
 def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
-    """The points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
+    """Return the points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
     flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
     # most of a cloud is far from the face's plane; NaN is nowhere near
     flat = flat[np.abs((flat - fit.center_C) @ fit.normal_C) < 2.0 * standard.chamfer_m + 0.002]

@@ -219,7 +219,7 @@ def _other_turns(
 
 
 def _about(xy: Array, expected: NDArray[np.complex128], nominal: Array) -> list[Array]:
-    """The face points (2, N_k) m about each expected hole."""
+    """Return the face points (2, N_k) m about each expected hole."""
     out = []
     for c, r in zip(expected, nominal, strict=True):
         x, y = xy[0] - c.real, xy[1] - c.imag

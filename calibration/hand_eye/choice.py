@@ -277,7 +277,7 @@ def solve(
 
 
 def _concentrated(problem: Problem, state: State) -> State:
-    """The state of the poses that agree best, where some may be outliers.
+    """Return the state of the poses that agree best, where some may be outliers.
 
     Few outliers of few poses hide in the noise that they cause.
 
@@ -360,7 +360,7 @@ def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...])
 
 
 def most_promising(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
-    """The start with the least cost after a descent from the most promising ones."""
+    """Return the start with the least cost after a descent from the most promising ones."""
     if not pool:
         return None, np.inf, ""
     length = problem.extent

@@ -148,7 +148,7 @@ def _sigma(deviance: Callable[[Array], float], shift: Array, least: float) -> Ar
 def _with_shift_uncertainty(
     result: HandEyeResult, solved: Callable[[Array], HandEyeResult], shift: Array, sigma: Array
 ) -> HandEyeResult:
-    """The covariance of the poses with what they change when the principal point does."""
+    """Return the covariance of the poses with what they change when the principal point does."""
     joint = result.joint_covariance.copy()
     for k in range(2):
         e = _STEP_PX * np.eye(2)[k]

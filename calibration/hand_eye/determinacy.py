@@ -207,7 +207,7 @@ def with_open_directions(covariance: Array, found: Determinacy, length: float) -
 
 
 def without_drift(problem: Problem, state: State, found: Determinacy) -> State:
-    """The solution with the shortest positions along directions that carry no information."""
+    """Return the solution with the shortest positions along directions that carry no information."""
     for v in found.directions:
         blocks = v.reshape(-1, 6)
         if float(np.abs(blocks[:, :3]).max()) > 1e-6 * float(np.abs(blocks[:, 3:]).max()):

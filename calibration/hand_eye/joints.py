@@ -87,7 +87,7 @@ class _Robot:
     camera: Array
 
     def problem(self, u: Array) -> Problem:
-        """The equation of one robot's poses with these errors."""
+        """Return the equation of one robot's poses with these errors."""
         errors = np.zeros(6 * self.arm.n)
         errors[self.which] = u * self.scale
         moved = self._undone @ flange_poses(self.arm, self.q, errors.reshape(-1, 6)) @ self.tool
@@ -100,7 +100,7 @@ class _Robot:
         return np.asarray(self.stated @ inverse(self.tool) @ inverse(as_is))
 
     def pick(self, rows: NDArray[np.bool_]) -> _Robot:
-        """The same robot at some of its poses."""
+        """Return the same robot at some of its poses."""
         return replace(self, stated=self.stated[rows], q=self.q[rows], camera=self.camera[rows])
 
 
@@ -190,7 +190,7 @@ def refine_joints(
 
 
 def poses_of_arm(pairs: PosePairs, arm: Chain) -> PosePairs:
-    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles.
+    """Return the pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles.
 
     A constant tool stays.
 

@@ -136,7 +136,7 @@ class TargetObservation:
 
 
 def get_mounting(name: str) -> Mounting:
-    """A mounting by name; InputError naming the known ones."""
+    """Return a mounting by name; InputError naming the known ones."""
     if name not in MOUNTINGS:
         raise InputError(f"There is no mounting '{name}'; choose one of {', '.join(MOUNTINGS)}.")
     return MOUNTINGS[name]
@@ -162,7 +162,7 @@ def chain(mounting: Mounting, X_BF: Array, X_BL: Array | None = None, X_DE: Arra
 def problem_of(
     mounting: Mounting, observations: Sequence[TargetObservation], known: dict[str, RigidTransform]
 ) -> Problem:
-    """The equation of these observations.
+    """Return the equation of these observations.
 
     ``known``: letters of unknowns that are given (a flange as target: Y or Z).
     """

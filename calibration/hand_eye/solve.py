@@ -332,7 +332,7 @@ def _held_out(
 
 
 def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
-    """A stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome.
+    """Return a stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome.
 
     Raises InputError naming the first bad one.
     """

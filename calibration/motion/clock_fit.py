@@ -401,7 +401,7 @@ def _polished_capture(
 def linearised(
     problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
 ) -> LinearisedStream:
-    """The model at capture times (N,) s.
+    """Return the model at capture times (N,) s.
 
     Residuals extrapolated to the nominal times, and their derivatives by all unknowns. ``rolling`` s, ``edge`` in
     noises of the face, rotations about ``pivot`` (3,) m.

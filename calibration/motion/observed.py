@@ -71,12 +71,12 @@ class FrameClock:
 
 
 def arrival_clock(frames: ObservedFrames, reason: str = "The frames have no device times.") -> FrameClock:
-    """The frames ordered by their arrivals."""
+    """Return the frames ordered by their arrivals."""
     return FrameClock(ARRIVAL, frames.arrival, -1.0, 0.0, float(np.median(frames.arrival)), reason)
 
 
 def choose_clock(frames: ObservedFrames) -> FrameClock:
-    """The device's clock where it runs evenly beside the arrivals; else the arrivals, with the reason."""
+    """Return the device's clock where it runs evenly beside the arrivals; else the arrivals, with the reason."""
     if frames.device is None or not np.isfinite(frames.device).any():
         return arrival_clock(frames)
     has = np.isfinite(frames.device)

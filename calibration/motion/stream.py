@@ -96,7 +96,7 @@ class ContinuousMotion:
         ]
 
     def known(self, t: Array) -> Flags:
-        """Whether the stream has data at times (N,) s."""
+        """Return whether the stream has data at times (N,) s."""
         x = np.asarray(t, dtype=float) - self._zero
         k = np.clip(np.searchsorted(self._begins, x, side="right") - 1, 0, None)
         return np.asarray((x >= self._begins[k]) & (x <= self._ends[k]))

@@ -106,7 +106,7 @@ def _search(
     X_BC: RigidTransform,
     X_FR: RigidTransform | None,
 ) -> float | None:
-    """The delay (s) with the least spread of the residuals; None where the spread hardly depends on it."""
+    """Return the delay (s) with the least spread of the residuals; None where the spread hardly depends on it."""
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < 3:
         return None

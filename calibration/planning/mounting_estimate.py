@@ -87,7 +87,7 @@ class MountingResult(HandEyeResult):
         return np.asarray(self.slopes(p_C) @ self.with_factors @ self.slopes(p_C).T)
 
     def place(self, p_C: Array) -> Array:
-        """A scanned point (3,) m in the frame that carries the scanner."""
+        """Return a scanned point (3,) m in the frame that carries the scanner."""
         return np.asarray(self.X @ self.correction.points(p_C))
 
     def slopes(self, p_C: Array) -> Array:
@@ -346,7 +346,7 @@ def _rows(data: _Data, state: State, correction: ScannerCorrection) -> tuple[Arr
 
 
 def _corrected(problem: Problem, p: Array, normal: Array) -> Problem:
-    """The problem with other centres (n, 3) and normals (n, 3) as measured."""
+    """Return the problem with other centres (n, 3) and normals (n, 3) as measured."""
     G = problem.G.copy()
     G[:, :3, 3] = p
     x = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])

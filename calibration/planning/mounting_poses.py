@@ -236,7 +236,7 @@ def _in_view(scene: MountingScene, plan: MountingPlan, X_CR: RigidTransform) -> 
 
 
 def _greedy(scene: MountingScene, pool: Sequence[MountingPose], plan: MountingPlan) -> list[int]:
-    """All poses of the pool, each the one that adds most to those before it."""
+    """Return all poses of the pool, each the one that adds most to those before it."""
     if not pool:
         return []
     gains = information(scene, pool, plan.sigma_position_m, plan.sigma_normal_rad)

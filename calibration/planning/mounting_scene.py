@@ -94,7 +94,7 @@ class MountingScene:
         return tuple(found)
 
     def carried(self, q: Array, q_2: Array | None) -> list[CarriedLink]:
-        """The links whose errors move scanner or circle, but not both."""
+        """Return the links whose errors move scanner or circle, but not both."""
         end = 0 if self.two or self.configuration in FOOT else FLANGE
         frames = self.frames(q)
         found = [(frames, k, float(k < self.link) - float(k < end), self.sizes[0]) for k in range(FLANGE)]
@@ -114,7 +114,7 @@ class MountingScene:
         return self.arm_2 is not None
 
     def believing(self, poses: dict[str, RigidTransform]) -> MountingScene:
-        """The same scene with what a calibration found (letters X, Y, Z of the mounting's unknowns)."""
+        """Return the same scene with what a calibration found (letters X, Y, Z of the mounting's unknowns)."""
         found = replace(self, X_LC=poses.get("X", self.X_LC))
         if self.two:
             return replace(found, X_BD=poses.get("Y", self.X_BD), X_HR=poses.get("Z", self.X_HR))
@@ -167,7 +167,7 @@ class MountingScene:
         return TargetObservation(X_BF=frames[FLANGE], p_CM=p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
 
     def problem(self, observations: Sequence[TargetObservation]) -> Problem:
-        """The equation of some observations."""
+        """Return the equation of some observations."""
         return problem_of(self.mounting, observations, self.known)
 
 

@@ -231,7 +231,7 @@ def _candidates(seen: Array, view: VisibleVolume) -> tuple[NDArray[np.int64], Ar
 def _reach(
     mounting: Mounting, F: Array, robot: Array | None, arm: Chain | None
 ) -> tuple[Callable[[int], tuple[bool, Array | None]], str, int]:
-    """Whether a candidate can be reached, with joint angles; in words; and how many to try (0: all)."""
+    """Return whether a candidate can be reached, with joint angles; in words; and how many to try (0: all)."""
     taken = _robot_poses(mounting, F)
     if robot is None or taken is None:
         return lambda _: (True, None), "Reach not checked: this mounting leaves the arm's pose open.", 0

@@ -140,7 +140,7 @@ def plan_sphere_poses(
 
 
 def _greedy(known: Floats, gains: Floats, names: NDArray[np.intp], maps: Floats, count: int) -> PosePlan:
-    """The best candidate at each step, by the mean trace of the mapped covariance of the sum."""
+    """Return the best candidate at each step, by the mean trace of the mapped covariance of the sum."""
     if len(names) < count:
         raise InputError(
             f"Of the candidate poses {len(names)} see the object in the field, fewer than the {count} asked for: give"

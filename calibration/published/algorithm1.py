@@ -278,7 +278,7 @@ def registered(points: Array, model: Array, normals: Array, reach: float, method
 
 
 def _without_last_digits(X: Array) -> RigidTransform:
-    """A pose (4, 4) to 1e-10 m and rad.
+    """Return a pose (4, 4) to 1e-10 m and rad.
 
     Open3D's threads add up in any order, so that the last digits are others in each run.
     """
@@ -356,7 +356,7 @@ COSTS = ("translation", "translation_and_rotation", "work_radius")
 
 
 def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
-    """The cost a scenario asks for: the translation.
+    """Return the cost a scenario asks for: the translation.
 
     Section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius (``work_radius``); or a bound on the
     error at that radius (``translation_and_rotation``). Raises InputError.

@@ -265,7 +265,7 @@ def choose_kinematics(
 def with_kinematics(
     estimate: CalibrationEstimate, choice: KinematicsChoice, observations: Sequence[Observation], q: Array
 ) -> tuple[CalibrationEstimate, list[Observation]]:
-    """The estimate of the accepted fit, and all observations as corrected by it."""
+    """Return the estimate of the accepted fit, and all observations as corrected by it."""
     f = choice.fit
     size = 6 + len(f.correction.values)
     moved = f.applied(observations, q)
@@ -292,7 +292,7 @@ def with_kinematics(
 
 
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
-    """The arm's link transforms with the errors found, as a file of Universal Robots' schema.
+    """Return the arm's link transforms with the errors found, as a file of Universal Robots' schema.
 
     m, rad; load_arm reads it.
     """
@@ -320,7 +320,7 @@ def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) ->
 
 
 def _told(fit: KinematicsFit) -> str:
-    """The errors that differ from zero by two sigma, the surest first."""
+    """Return the errors that differ from zero by two sigma, the surest first."""
     rows = sorted(
         zip(fit.errors.names, fit.values, fit.sigma, strict=True), key=lambda row: -abs(float(row[1] / row[2]))
     )

@@ -66,7 +66,7 @@ def _design(rays: Array, theta_rad: Array) -> Array:
 
 
 def solve_closed_form(rays: Array, hand: Array, theta_rad: Array) -> ClosedForm:
-    """The least squares itself, nothing checked: rays (2, n), hand (2, n) m, theta (n,) rad.
+    """Return the least squares itself, nothing checked: rays (2, n), hand (2, n) m, theta (n,) rad.
 
     Normal equations: with rays instead of millimetres the design's condition is below 1e2, so that squaring it costs
     four of sixteen digits. Left-out errors come from the leverages: e_i of the fit without both rows of landmark i is

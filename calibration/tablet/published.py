@@ -186,7 +186,7 @@ def apply_affine(a: Array, points: Array, about: Array | None = None) -> Array:
 
 
 def fitness(residuals: Array) -> Fitness:
-    """The paper's figures from the differences (2 n, 2) mm of one parameter set."""
+    """Return the paper's figures from the differences (2 n, 2) mm of one parameter set."""
     d = np.linalg.norm(residuals.reshape(-1, 2), axis=-1)
     n = len(d) // 2
     f1, f2 = float(d[:n].mean()), float(d[n:].mean())
@@ -271,7 +271,7 @@ class StageResult:
 
 
 def from_the_middle(residuals: Residuals, search: Array) -> DistanceMinimum:
-    """The fast solver from the middle of the range, where there is no better idea."""
+    """Return the fast solver from the middle of the range, where there is no better idea."""
     return minimise_distances(residuals, search.mean(axis=1), search)
 
 

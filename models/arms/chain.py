@@ -50,12 +50,12 @@ def known_chains() -> tuple[str, ...]:
 
 
 def is_urdf(name: str) -> bool:
-    """Whether an arm's name is that of a URDF file."""
+    """Return whether an arm's name is that of a URDF file."""
     return name.lower().endswith(".urdf")
 
 
 def load_chain(name: str, kinematics: Path | None = None) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain.
+    """Return the arm of that name, or of a URDF file, as a chain.
 
     ``kinematics``: the file of one Universal Robots arm (see load_arm).
 
@@ -92,12 +92,12 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
 
 
 def chain_capsules(name: str) -> list[list[float]]:
-    """The capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
+    """Return the capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
     return [[float(v) for v in row] for row in yaml_load_file(str(_HERE / name / "chain.yaml"))["capsules"]]
 
 
 def chain_of(arm: ArmModel) -> Chain:
-    """A Universal Robots arm with its own kinematics as a chain."""
+    """Return a Universal Robots arm with its own kinematics as a chain."""
     return Chain(
         name=arm.name,
         joint_names=arm.joint_names,

@@ -168,13 +168,13 @@ class LoadedTool:
 
 
 def tool_file(name: Path) -> Path:
-    """The file of a tool that is given by its path, or by the name of one that weldcal has, such as tip_1p5."""
+    """Return the file of a tool that is given by its path, or by the name of one that weldcal has, such as tip_1p5."""
     own = WELDING.parent / f"{name}.yaml"
     return own if not name.is_file() and own.is_file() else name
 
 
 def load_tool(path: Path) -> LoadedTool:
-    """The tool of a file; files that it names are relative to it.
+    """Return the tool of a file; files that it names are relative to it.
 
     Raises:
         InputError: the file cannot be read, has an unknown key, or describes a tool that cannot be.
@@ -372,7 +372,7 @@ def _shape(path: Path, i: int, part: ShapePart) -> ToolShape:
 
 
 def _keep_clear(part: ToolPart, shapes: tuple[ToolShape, ...]) -> tuple[Capsule, ...]:
-    """The file's capsules, or capsules about the shapes, the finger and the wire."""
+    """Return the file's capsules, or capsules about the shapes, the finger and the wire."""
     if part.keep_clear:
         return tuple(
             Capsule(LAST_LINK, np.array(_metres(c.from_mm)), np.array(_metres(c.to_mm)), c.radius_mm / 1e3)

@@ -244,7 +244,7 @@ def make_workpiece(
 def _drawing(
     shape: str, length: float, radius: float | None, width: float | None, thickness: float
 ) -> tuple[PlanarPath, tuple[float, float, float], float]:
-    """The seam's path in P, the plate's size and the corner radius, as drawn."""
+    """Return the seam's path in P, the plate's size and the corner radius, as drawn."""
     if shape == "straight":
         return PlanarPath((-0.5 * length, 0.0, 0.0), ((length, 0.0),)), (length, width or 0.200, thickness), math.inf
     if shape == "s":
@@ -325,7 +325,7 @@ def _groove_solid(
     radius: float,
     spacing: float,
 ) -> TriMesh:
-    """The walls with a band of top face and a body below, closed; long triangles where the seam is straight."""
+    """Return the walls with a band of top face and a body below, closed; long triangles where the seam is straight."""
     band = half_width + min(GROOVE_BAND_M, 0.8 * (radius - half_width))
     floor = -0.5 * (depth + thickness)
     columns = np.array([band, half_width, 0.0, -half_width, -band, -band, band])

@@ -107,11 +107,11 @@ class StationBuild:
         return system
 
     def find(self, kind: type[Part]) -> Part | None:
-        """The part of this type; None where the station has none."""
+        """Return the part of this type; None where the station has none."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
     def require(self, kind: type[Part]) -> Part:
-        """The part of this type; raises RuntimeError where the station has none."""
+        """Return the part of this type; raises RuntimeError where the station has none."""
         found = self.find(kind)
         if found is None:
             raise RuntimeError(f"this driver needs a {kind.__name__} in the station")

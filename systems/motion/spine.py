@@ -122,7 +122,7 @@ class ProcessSwitch(LeafSystem):
         return bool(self._margin.Eval(context)[1] > 0.5)
 
     def _free(self, context: Context) -> bool:
-        """Whether robot and guard both allow the process."""
+        """Return whether robot and guard both allow the process."""
         return bool(self._status.Eval(context).ready and not self._stopped(context))
 
     def _latch(self, context: Context, discrete: DiscreteValues) -> None:

@@ -145,7 +145,7 @@ class CameraDirector(LeafSystem):
         self._last, self._views.showing = (view, eye, target), view
 
     def _report(self) -> Array | None:
-        """The camera (3,) m of the browser that changed last.
+        """Return the camera (3,) m of the browser that changed last.
 
         None where no browser has reported since the last call.
         """
@@ -159,11 +159,11 @@ class CameraDirector(LeafSystem):
         return p
 
     def _moved(self, p: Array) -> bool:
-        """Whether the camera at `p` (3,) m is neither where one was put nor where a page begins."""
+        """Return whether the camera at `p` (3,) m is neither where one was put nor where a page begins."""
         return bool(self._put) and float(np.linalg.norm([*self._put, *START_M] - p, axis=1).min()) > MOVED_M
 
     def _reloaded(self, p: Array) -> bool:
-        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it.
+        """Return whether the only browser shows a camera at `p` (3,) m that Meshcat gave it.
 
         Its page was reloaded after it was moved.
         """

@@ -302,7 +302,7 @@ def face_residuals(points_C: Array, status: CalibrationStatus) -> Array:
 
 
 def _circle_pose(fit: FlangeFit, status: CalibrationStatus) -> RigidTransform:
-    """The pose of a found circle in C, where the scanner's correction puts it."""
+    """Return the pose of a found circle in C, where the scanner's correction puts it."""
     return RigidTransform(
         RotationMatrix.MakeFromOneVector(np.asarray(fit.normal_C), 2), status.correction.points(fit.center_C)
     )

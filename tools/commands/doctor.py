@@ -102,7 +102,7 @@ def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Prog
 
 
 def _other_flange(data: Dataset, stated: FlangeStandard) -> FlangeStandard:
-    """The standard flange that a few scans show where they do not show the stated one; else the stated one."""
+    """Return the standard flange that a few scans show where they do not show the stated one; else the stated one."""
     ids = list(data.clouds)
     some = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(_LOOKED_AT, len(ids))).astype(int))]
     if len(_found_in(data, some, stated)) > len(some) // 2:

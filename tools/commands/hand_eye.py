@@ -346,7 +346,7 @@ def run_hand_eye(
 
 
 def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
-    """The pairs of two recordings in motion of a folder; None where it holds none."""
+    """Return the pairs of two recordings in motion of a folder; None where it holds none."""
     if not path.is_dir() or (path / "pairs.npz").exists():
         return None
     try:
@@ -427,7 +427,7 @@ def _only_camera(result: HandEyeResult) -> HandEyeResult:
 
 
 def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEyeResult:
-    """The poses of a file's mounting, with a test for the usual mistakes in files.
+    """Return the poses of a file's mounting, with a test for the usual mistakes in files.
 
     Raises:
         InconsistentPoses: the correction of one mistake makes the poses agree far better; others as solve_problem.
@@ -475,7 +475,7 @@ def solve_arrays(
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:
-    """The equation of a file's mounting."""
+    """Return the equation of a file's mounting."""
     return full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, pairs.mode == "co_manipulation"))
 
 

@@ -54,7 +54,7 @@ class Imported:
     notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of the command."""
+        """Return the JSON object of the command."""
         return {
             "state": "done",
             "kind": self.kind,

@@ -115,7 +115,7 @@ def monitor(
 
 
 def _is_scenario(name: str) -> bool:
-    """Whether a name is that of a scenario and not of a recording's folder."""
+    """Return whether a name is that of a scenario and not of a recording's folder."""
     return not Path(name).is_dir() and (name.endswith((".yaml", ".yml")) or name in scenario_names())
 
 
@@ -331,7 +331,7 @@ class LiveMonitor:
         return replace(first, found=replace(first.found, against=[*held, *first.found.against]))
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object: the run, then what `monitor` says of a recording, which it ends with."""
+        """Return the JSON object: the run, then what `monitor` says of a recording, which it ends with."""
         run = self.finished.run
         job: AddedMotion = run.cell.job
         live = job.drift(run.root)
@@ -361,7 +361,7 @@ class LiveMonitor:
 
 
 def monitored_scenario(name: str, calibration: Path, frames: int | None, false_alarms_per_hour: float) -> Scenario:
-    """The scenario as it is watched: its motion, or that of the default cube where it has another job.
+    """Return the scenario as it is watched: its motion, or that of the default cube where it has another job.
 
     Raises:
         InputError: its scanner does not stream, or it cannot be run so.

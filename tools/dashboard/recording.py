@@ -20,7 +20,7 @@ _ROWS = 1500  # of the weld, in the page
 
 
 def with_overlay(html: str, run: Run[Any], live: LiveView, title: str) -> str:
-    """The page of Meshcat.StaticHtml() with the overlay of this run; unchanged where it has no end of a body."""
+    """Return the page of Meshcat.StaticHtml() with the overlay of this run; unchanged where it has no end of a body."""
     head, end, tail = html.rpartition("</body>")
     if not end:
         return html

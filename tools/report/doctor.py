@@ -43,7 +43,7 @@ class DoctorReport:
     spread_mm: float | None
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `doctor`."""
+        """Return the JSON object of `doctor`."""
         return {
             "state": "done",
             "source": self.source,
@@ -54,7 +54,7 @@ class DoctorReport:
         }
 
     def text(self) -> str:
-        """The printed answer."""
+        """Return the printed answer."""
         if not self.causes:
             return (
                 f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(CHECKED)}\n  Where"
@@ -73,7 +73,7 @@ class DoctorReport:
 
 
 def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
-    """The report of a diagnosis: at most three causes."""
+    """Return the report of a diagnosis: at most three causes."""
     spread = 1e3 * diagnosis.spread_m
     return DoctorReport(
         source,

@@ -164,7 +164,7 @@ def plain(axes: Axes, x: str, y: str) -> None:
 
 
 def svg(figure: Figure, *all_axes: Axes) -> bytes:
-    """The figure as SVG, the same bytes for the same data."""
+    """Return the figure as SVG, the same bytes for the same data."""
     for axes in all_axes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e6e9", linewidth=0.8)

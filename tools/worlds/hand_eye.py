@@ -116,7 +116,7 @@ def imperfect_cell(kind: str, seed: int) -> PairedPoses:
 def _read(
     true: Array, kind: str, board: Array, true_K: Array, bend: Array, K: Array, pixel: float, rng: np.random.Generator
 ) -> Array | None:
-    """The board's pose as a program estimates it, None where too little of it is in the image."""
+    """Return the board's pose as a program estimates it, None where too little of it is in the image."""
     in_camera = board @ true[:3, :3].T + true[:3, 3]
     if float(in_camera[:, 2].min()) < 0.1:
         return None
@@ -378,7 +378,7 @@ def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
 def _written(
     lists: list[Array], rng: np.random.Generator, unit: float, may_change: bool
 ) -> tuple[list[PoseNumbers], str]:
-    """The lists in one random convention, and the form that reads them."""
+    """Return the lists in one random convention, and the form that reads them."""
     change = str(rng.choice(["", "", "transposed", "left_handed"])) if may_change else ""
     kind = str(rng.choice(["vector", "vector", "vector", "quaternion", "matrix"]))
     order, angles, which = (

@@ -58,7 +58,7 @@ class Trapezoid:
         return 1.0 / (self.a * self.ramp_s) + self.ramp_s
 
     def s(self, t: float) -> float:
-        """The parameter at ``t`` s after the start."""
+        """Return the parameter at ``t`` s after the start."""
         ramp, whole = self.ramp_s, self.duration_s
         if t <= 0.0:
             return 0.0
@@ -150,7 +150,7 @@ def path_through(
     acceleration: float = 1.2,
     dwell_s: float = 0.0,
 ) -> RobotPath:
-    """A closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
+    """Return a closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
 
     Raises InputError out of reach.
     """
@@ -241,7 +241,7 @@ class _Cast:
 
 
 def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
-    """The drawn solids of an arm and the mesh of its flange, in their links' frames."""
+    """Return the drawn solids of an arm and the mesh of its flange, in their links' frames."""
     root = ET.fromstring(arm_urdf(arm))
     bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
@@ -280,7 +280,7 @@ class MovingScene:
         scanner: ScannerPreset | None = None,
         X_BW: RigidTransform | None = None,
     ) -> Depth:
-        """The depth map (H, W) m of one frame, 0 where nothing was measured.
+        """Return the depth map (H, W) m of one frame, 0 where nothing was measured.
 
         ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle
         row. ``samples`` times of the exposure are mixed. ``scanner`` has the errors of this frame (the preset's).

@@ -97,7 +97,7 @@ def warped_observations(
 
 
 def _circle(X_CR: RigidTransform, center_C: Array, ratio: float) -> HolePattern:
-    """The hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
+    """Return the hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
     return HolePattern(holes_C=np.zeros((4, 3)), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0)
 
 
@@ -169,7 +169,7 @@ WRONG = ScannerCorrection(1.002, (0.006, -0.004))
 def measured_by_a_wrong_scanner(
     observations: list[Observation], rng: np.random.Generator
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
+    """Return the same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
     out, patterns = [], {}
     for o in observations:
         seen = as_measured(np.asarray(o.p_CR))

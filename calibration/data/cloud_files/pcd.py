@@ -159,7 +159,7 @@ def _header(path: Path, begin: bytes) -> _Header:
 
 
 def _viewpoint(path: Path, words: list[str]) -> tuple[float, ...]:
-    """The seven numbers of VIEWPOINT; empty where it is the identity or not stated."""
+    """Return the seven numbers of VIEWPOINT; empty where it is the identity or not stated."""
     if not words:
         return ()
     try:

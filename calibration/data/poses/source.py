@@ -167,7 +167,7 @@ def _apart(ids: Sequence[str], clouds: Sequence[Path], source: str) -> DatasetEr
 
 
 def find_poses(folder: Path) -> Path | tuple[Path, ...] | None:
-    """The poses of a folder: a file, one file per pose in the natural order of their names, or None.
+    """Return the poses of a folder: a file, one file per pose in the natural order of their names, or None.
 
     Known are poses.* and the like, a folder poses/, and files such as pos01.yaml beside the clouds.
     """
@@ -205,7 +205,7 @@ def is_plain(path: Path) -> bool:
 
 
 def files_of_poses(folder: Path) -> tuple[Path, ...]:
-    """The files of a folder that may hold poses, in the natural order of their names."""
+    """Return the files of a folder that may hold poses, in the natural order of their names."""
     return tuple(_files(folder))
 
 
@@ -250,7 +250,7 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
 
 
 def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
-    """The list of the flange's poses among those of a file.
+    """Return the list of the flange's poses among those of a file.
 
     The only one, the one of the flange's frame, or the one that names the robot.
     """

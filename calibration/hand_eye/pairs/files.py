@@ -115,7 +115,7 @@ def read_pairs(
 def pairs_of_lists(
     lists: list[Listing], names: str, *, mounting: str | None, length: str | None, stated: StatedForms
 ) -> PosePairs:
-    """The pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
+    """Return the pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
     mounting = None if mounting is None else mounting_name(mounting)
     return _pairs(Path(names), lists, {}, mounting, length, stated)
 
@@ -180,7 +180,7 @@ def _pairs(
 
 
 def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
-    """The lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
+    """Return the lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
     if path.is_dir():
         description = path / "dataset.yaml"
         raw = read_tree(description) if description.is_file() else {}

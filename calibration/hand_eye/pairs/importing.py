@@ -80,7 +80,7 @@ class ImportedPairs:
 
 
 def import_pairs(lists: list[Listing], source: str, mounting: str, stated: StatedForms) -> ImportedPairs:
-    """The pairs of two lists of poses, each read as the data and the user's statements say.
+    """Return the pairs of two lists of poses, each read as the data and the user's statements say.
 
     Args:
         lists: those of the source.
@@ -157,7 +157,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
 
 
 def _with_name(listing: Listing, form: PoseForm) -> PoseForm:
-    """The stated form, inverted where the list's name says so."""
+    """Return the stated form, inverted where the list's name says so."""
     return replace(form, frame="base_in_flange") if named_inverse(listing) and form.frame == "flange_in_base" else form
 
 
@@ -168,7 +168,7 @@ def _metric(X: Array, factor: float) -> Array:
 
 
 def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
-    """The chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
+    """Return the chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
     same = [one for one in listed if one.form == chosen.form]
     return min(same, key=lambda one: float(np.abs(one.X - chosen.X[0]).max(axis=(1, 2)).min()))
 
@@ -204,7 +204,7 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
 def decided(
     a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int
 ) -> tuple[ReadingDecision | None, int]:
-    """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
+    """Return the decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
     if n < _FEWEST:
         return None, 0
     some = np.unique(np.linspace(0, n - 1, min(n, _MOST_COMPARED)).round().astype(int))

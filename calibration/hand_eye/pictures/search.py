@@ -124,7 +124,7 @@ def picture_files(folder: Path, named: str | None = None) -> list[Path]:
 
 
 def camera_in(folder: Path) -> tuple[Path, CameraFile] | None:
-    """The file of a folder that is named as a camera's and states one, or None."""
+    """Return the file of a folder that is named as a camera's and states one, or None."""
     found = [p for pattern in ("*", "*/*") for p in sorted(folder.glob(pattern)) if p.is_file()]
     for path in found:
         if path.suffix.lower() in _CAMERA_ENDINGS and _CAMERA.match(path.stem):
@@ -136,7 +136,7 @@ def camera_in(folder: Path) -> tuple[Path, CameraFile] | None:
 
 
 def load_grey(path: Path) -> NDArray[np.uint8] | None:
-    """A picture in 8 bits of grey; None where it cannot be read."""
+    """Return a picture in 8 bits of grey; None where it cannot be read."""
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError:
@@ -156,7 +156,7 @@ def load_grey(path: Path) -> NDArray[np.uint8] | None:
 
 
 def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, list[Picture]]:
-    """The board in every picture, on two threads.
+    """Return the board in every picture, on two threads.
 
     Raises:
         DatasetError: it is in fewer than four; the sentence says what was found in its place.
@@ -223,13 +223,13 @@ def _thumbnail(grey: NDArray[np.uint8], points: Array) -> bytes:
 
 
 def common_size(pictures: Sequence[Picture]) -> tuple[int, int]:
-    """The size of most pictures in which the board was found."""
+    """Return the size of most pictures in which the board was found."""
     sizes = [p.size for p in pictures if not p.why]
     return max(set(sizes), key=sizes.count)
 
 
 def sized(picture: Picture, size: tuple[int, int]) -> Picture:
-    """The picture, not used where it has another size."""
+    """Return the picture, not used where it has another size."""
     if picture.why or picture.size == size:
         return picture
     return replace(

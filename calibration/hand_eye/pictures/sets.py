@@ -67,7 +67,7 @@ def read_pictures(
     stated: StatedForms | None = None,
     camera: Path | None = None,
 ) -> PictureSet:
-    """The pictures of a folder with the robot's poses.
+    """Return the pictures of a folder with the robot's poses.
 
     Args:
         folder: it holds the pictures and the robot's poses in any form of docs/datasets.md; ``--camera-poses`` of
@@ -256,7 +256,7 @@ def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
 
 
 def _flipped(C: Array, labels: NDArray[np.int64], board: Board) -> Array:
-    """The boards' poses with another order of their points."""
+    """Return the boards' poses with another order of their points."""
     turns = [_turn(board, order) for order in board.symmetries]
     return np.stack([X @ turns[int(k)] for X, k in zip(C, labels, strict=True)])
 

@@ -142,7 +142,7 @@ class DriftTest:
         return self._alarm_s is not None
 
     def current(self) -> tuple[RigidTransform, Array]:
-        """The scanner's pose as it is now, and its covariance (6, 6) [rotation.
+        """Return the scanner's pose as it is now, and its covariance (6, 6) [rotation.
 
         Translation] about the camera's origin: the calibration, corrected by what all frames since the last change say.
         This is the recalibration.
@@ -261,7 +261,7 @@ class DriftTest:
             self._alarm_s, self._settles_s = t, t + self.config.confirm_s
 
     def _settle(self, t: float, *, last: bool = False) -> list[DriftEvent]:
-        """The event of the best hypothesis; the filter goes on from the pose after it.
+        """Return the event of the best hypothesis; the filter goes on from the pose after it.
 
         An alarm that has faded is withdrawn.
         """

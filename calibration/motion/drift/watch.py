@@ -193,7 +193,7 @@ def watch(
 def drift_config(
     sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
-    """The test's settings for a calibration.
+    """Return the test's settings for a calibration.
 
     Its spread of scanner and arm is that of the field, where it states a larger one.
     """
@@ -225,7 +225,7 @@ def _tested(
     pivot = at.p[order].mean(axis=0)
 
     def rows_with(p_C: Array, n_C: Array) -> Rows:
-        """The residuals with these centres and normals of the frames."""
+        """Return the residuals with these centres and normals of the frames."""
         seen = (p_C, n_C, frames.covariance, frames.normal_sigma)
         return rows_of(result.X_BC, pivot, *(a[order] for a in (clock.times, at.p, at.n, at.v, at.turn, *seen)))
 

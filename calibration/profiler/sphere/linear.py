@@ -150,7 +150,7 @@ def fit_touch_sphere(
     solve_tip: bool = False,
     solve_radius: bool = False,
 ) -> TouchSphere:
-    """The sphere that the tip touched, and on wish the tip (orientations must vary) or the radius with it.
+    """Return the sphere that the tip touched, and on wish the tip (orientations must vary) or the radius with it.
 
     Args:
         rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m, at each touch; tip: (3,) m in F, as far as it is known.

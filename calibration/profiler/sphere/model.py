@@ -70,7 +70,7 @@ class SphereData:
     touch_q: Floats | None = None
 
     def without(self, *scans: int) -> SphereData:
-        """The same but for these scans."""
+        """Return the same but for these scans."""
         keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
         profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
@@ -193,7 +193,7 @@ class SphereProblem:
         return points.at, points.felt, points.poses
 
     def _points(self, x: Floats) -> _Points:
-        """The points placed by x.
+        """Return the points placed by x.
 
         The last answer is kept: a solver asks for residuals and derivatives at the same x.
         """

@@ -86,7 +86,7 @@ def read_table(path: Path, columns: Sequence[str]) -> list[Row]:
 
 
 def number(row: Row, column: str, path: Path) -> float:
-    """The finite number of a column; raises TabletDataError."""
+    """Return the finite number of a column; raises TabletDataError."""
     try:
         value = float(row[column])
     except ValueError:
@@ -99,7 +99,7 @@ def number(row: Row, column: str, path: Path) -> float:
 
 
 def landmark(row: Row, path: Path) -> int:
-    """The landmark's number, from 0; raises TabletDataError."""
+    """Return the landmark's number, from 0; raises TabletDataError."""
     value = number(row, "landmark", path)
     if value < 0.0 or value != int(value):
         raise TabletDataError(f"'{path.name}': landmarks are whole numbers from 0, not '{row['landmark'][:40]}'.")
@@ -269,7 +269,7 @@ def load_visit(
 
 
 def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:
-    """The flange where the image was taken, and at each landmark."""
+    """Return the flange where the image was taken, and at each landmark."""
     found: dict[int, RigidTransform] = {}
     X_camera: RigidTransform | None = None
     for row in read_table(path, POSE_COLUMNS):

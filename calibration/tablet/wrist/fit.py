@@ -40,7 +40,7 @@ class WristTouches:
     tip_radius_m: float = 0.0
 
     def pick(self, keep: NDArray[np.bool_]) -> WristTouches:
-        """The same visit with these landmarks only."""
+        """Return the same visit with these landmarks only."""
         poses = tuple(X for X, k in zip(self.X_BF, keep, strict=True) if k)
         views = tuple((X, rays[keep]) for X, rays in self.views)
         return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px, self.tip_radius_m)
@@ -160,7 +160,7 @@ def _axis_spread(poses: tuple[RigidTransform, ...]) -> float:
 
 
 def linear_system(data: WristTouches) -> tuple[Array, Array]:
-    """A (3 n, 12) and b (3 n,) of R_BF p_FP + p_BF = r1 x + r2 y + p_BT in r1, r2, p_BT and p_FP, three each."""
+    """Return a (3 n, 12) and b (3 n,) of R_BF p_FP + p_BF = r1 x + r2 y + p_BT in r1, r2, p_BT and p_FP, three each."""
     A = np.zeros((len(data.X_BF), 3, 12))
     for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
         A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)

@@ -35,7 +35,7 @@ class FolderProfiler(WiredProfiler):
     remove_read: bool = False
 
     def source(self) -> FolderSource[Profile]:
-        """The folder as a source of profiles. Raises InputError for keys that cannot be used."""
+        """Return the folder as a source of profiles. Raises InputError for keys that cannot be used."""
 
         def read(path: Path) -> Profile:
             return checked_profile(read_profile(path), {"m": 1.0, "mm": 1e-3}[self.unit], self)

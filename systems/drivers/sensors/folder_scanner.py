@@ -27,7 +27,7 @@ class FolderScanner(WiredScanner):
     remove_read: bool = False  # delete files that were read
 
     def source(self) -> FolderSource[Cloud]:
-        """The folder as a source of clouds. Raises InputError for keys that cannot be used."""
+        """Return the folder as a source of clouds. Raises InputError for keys that cannot be used."""
         metres, far_m = self.metres, self.scanner().far_m
 
         def read(path: Path) -> Cloud:

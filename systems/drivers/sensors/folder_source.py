@@ -130,7 +130,7 @@ class TcpTrigger(Trigger):
 
 
 def trigger_of(text: str) -> Trigger:
-    """The trigger of a scenario's word: empty, `file:PATH`, or `tcp://HOST:PORT`.
+    """Return the trigger of a scenario's word: empty, `file:PATH`, or `tcp://HOST:PORT`.
 
     Raises:
         InputError: it is none of these.
@@ -314,7 +314,7 @@ class FolderSource(Source[Datum]):
             raise DeviceLost(f"the folder '{self.folder}' cannot be read: {error.strerror}") from error
 
     def _read(self, path: Path) -> Delivery[Datum] | None:
-        """The datum of a settled file; None where it may still be incomplete.
+        """Return the datum of a settled file; None where it may still be incomplete.
 
         Raises Garbage where it cannot be used.
         """

@@ -90,7 +90,7 @@ class SourceProcess(Source[Datum]):
             raise self._ended() from None
 
     def _answer(self, timeout_s: float) -> Delivery[Datum] | None:
-        """The frame, or None for `opened`, that the process sent. Raises what the source raised there."""
+        """Return the frame, or None for `opened`, that the process sent. Raises what the source raised there."""
         assert self._pipe is not None
         try:
             if not self._pipe.poll(timeout_s):

@@ -151,7 +151,7 @@ class Profiler(Job[PlanningContext]):
 
 
 def planning_context(scenario: Scenario, station: Station) -> PlanningContext:
-    """The nominal data with which the procedure starts, from drawings only."""
+    """Return the nominal data with which the procedure starts, from drawings only."""
     job, profiler, spec = scenario.part(ProfilerJob), scenario.profiler, scenario.workpiece
     if job is None or not isinstance(profiler, RenderedProfiler):
         raise InputError("This scenario has no profiler: write profiler: !RenderedProfiler {} and profiler_job: {}.")

@@ -192,7 +192,7 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         return self.go(s, now, "go_home", self._motion.q_home)
 
     def _framed(self, s: TouchState, now: TouchInputs) -> TouchState:
-        """The state with a new valid frame of the finger camera."""
+        """Return the state with a new valid frame of the finger camera."""
         sequence, sample = now.deformation.sequence, now.deformation.sample
         if sequence <= s.seen or sample is None or not sample.valid:
             return s

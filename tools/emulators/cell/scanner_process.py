@@ -93,7 +93,7 @@ class Renderer:
         self._scans = 0
 
     def scan(self, positions: Array) -> Array:
-        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest.
+        """Return the organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest.
 
         A profile is (n, 2) m.
         """

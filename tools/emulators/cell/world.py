@@ -67,7 +67,7 @@ class Wires:
 
 
 def wires_of(cell: Scenario) -> Wires:
-    """The wires of a cell's scenario, all on loopback.
+    """Return the wires of a cell's scenario, all on loopback.
 
     Raises:
         InputError: a device of the scenario is not by wire, or not on loopback.
@@ -232,7 +232,7 @@ class _World:
 
 
 def _probe_of(physics: Physics, config: UrTouchProbe | None) -> TouchProbe | None:
-    """The world's touch probe; raises InputError where the world has no sphere that it could touch."""
+    """Return the world's touch probe; raises InputError where the world has no sphere that it could touch."""
     if config is None:
         return None
     truth = physics.station.truth.profiler

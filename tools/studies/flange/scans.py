@@ -175,7 +175,7 @@ def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], 
 
 
 def _with_filled(standard: FlangeStandard, filled: Sequence[int]) -> FlangeStandard:
-    """The flange without these of its openings (threads in order, then the dowel hole)."""
+    """Return the flange without these of its openings (threads in order, then the dowel hole)."""
     threads = tuple(a for k, a in enumerate(standard.hole_angles_rad) if k not in filled)
     pin = 0.0 if standard.n_holes in filled else standard.pin_m
     return replace(standard, n_holes=len(threads), hole_angles_rad=threads, pin_m=pin)

@@ -123,7 +123,7 @@ def _figures(results: Results) -> Figures:
 
 
 def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
-    """A trial's fields; JSON has null for NaN."""
+    """Return a trial's fields; JSON has null for NaN."""
     return {name: float("nan") if value is None else value for name, value in result.items()}
 
 
@@ -181,7 +181,7 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
 
 
 def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
-    """A recording with a creep of 0.02 mm/min in a random direction."""
+    """Return a recording with a creep of 0.02 mm/min in a random direction."""
     rng = np.random.default_rng([seed, 4])
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
@@ -233,13 +233,13 @@ def expected_late(knocks: Sequence[DriftTrial]) -> float:
 
 
 def _moved(w: FeatureWorld, change: tuple[float, Array, Array]) -> Array:
-    """A change [rotation; translation] (6,) about the pivot."""
+    """Return a change [rotation; translation] (6,) about the pivot."""
     _, shift, rotation = change
     return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
 
 
 def _within(w: FeatureWorld, at: float) -> NDArray[np.intp]:
-    """The frames of WITHIN_S after a time."""
+    """Return the frames of WITHIN_S after a time."""
     return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
 
 

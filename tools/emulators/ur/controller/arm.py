@@ -101,7 +101,7 @@ class Compliance:
 def force_task(
     frame: list[float], selection: Array, wrench: Array, kind: int, limits: Array, gain_scaling: float
 ) -> Task:
-    """The task of one call of force_mode."""
+    """Return the task of one call of force_mode."""
     # for an axis that is not compliant the limit is a deviation, which this arm has none of
     return Task(matrix(frame), selection, wrench, kind, np.abs(limits), DAMPING / max(gain_scaling, 1e-3))
 
@@ -305,7 +305,7 @@ class EmulatedArm:
         return matrix(pose) @ inverse(self.X_FT)
 
     def tool_pose(self, target: bool = False) -> list[float]:
-        """The tool's pose in the base, from the actual or the target joints."""
+        """Return the tool's pose in the base, from the actual or the target joints."""
         cache = self._cache_of(target)
         if "pose" not in cache:
             R, p, _ = self._tool(cache, target)
@@ -313,7 +313,7 @@ class EmulatedArm:
         return list(cache["pose"])
 
     def tool_speed(self, target: bool = False) -> list[float]:
-        """The tool's twist [v; w] in base axes (m/s, rad/s)."""
+        """Return the tool's twist [v; w] in base axes (m/s, rad/s)."""
         qd = self.qd_target if target else self.qd
         if not qd.any():
             return [0.0] * 6

@@ -298,7 +298,7 @@ def _circle_row(material: Material, id: str, R_BC: Array, seed: int) -> CircleRo
 
 
 def see_halves(face: Array, half: NDArray[np.bool_], standard: FlangeStandard) -> tuple[Array, Array]:
-    """The edges' centres (3,) m from either half of a cloud."""
+    """Return the edges' centres (3,) m from either half of a cloud."""
     return fit_flange(face[half], standard).center_C, fit_flange(face[~half], standard).center_C
 
 

@@ -181,7 +181,7 @@ class KinectOutcome:
 
 
 def paper_error() -> RigidTransform:
-    """The e of section 4.2 as a transform."""
+    """Return the e of section 4.2 as a transform."""
     return RigidTransform(RollPitchYaw(*np.radians(PAPER_E_RPY_DEG)), 1e-3 * np.array(PAPER_E_XYZ_MM))
 
 

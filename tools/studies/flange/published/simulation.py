@@ -80,7 +80,7 @@ class Simulation:
 
 
 def grid_points() -> Array:
-    """The 75 flange centres (75, 3) m in the base."""
+    """Return the 75 flange centres (75, 3) m in the base."""
     axes = [c + np.linspace(-0.5, 0.5, n) * w for c, n, w in zip(WORKSPACE_CENTRE_M, GRID, WORKSPACE_M, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
