@@ -154,11 +154,11 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
     numbers. ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be
     carried by an arm.
 
-    Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
-    unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
-    whose size shows the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name;
-    clouds themselves are read later. A scan
-    that repeats another one to the last digit is refused by name.
+    Raises DatasetError, one sentence, for what makes the whole folder unusable. That is a missing or wrong file, an
+    unknown unit or configuration, or a cell that is not a number. It is also a quaternion that is not a unit one, an
+    id given twice, or poses whose size shows the wrong unit. A cloud without a pose is an error. A pose without a cloud
+    is refused by name. Clouds themselves are read later. A scan that repeats another one to the last digit is refused
+    by name.
     """
     folder = Path(folder)
     if folder.is_file() and find_bag(folder) is None:

@@ -46,11 +46,11 @@ class ArmDerivatives:
 class DoctorCase:
     """n scans of a flange.
 
-    X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m (n, 3)
-    in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face
-    about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
+    X_BF (n, 4, 4) as the robot states it. X_FR (4, 4) of the feature. Centres c (n, 3) m and outward normals m (n, 3)
+    in the camera (NaN rows: not found). ``time`` (n,) s or the order of the scans. ``noise`` (n,) m rms of each face
+    about its plane (NaN: unknown). ``coverage`` (n,) visible share of the edge.
 
-    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the
+    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as a user measured it, good to ``guess_radius`` m at the
     feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
     ``refused`` lists (id, reason); ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have
     positions only. Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).

@@ -21,9 +21,9 @@ def sampling_advice(
 ) -> tuple[str, ...]:
     """Advice from an estimate and the observations that made it (outliers are ignored).
 
-    Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
-    field a scanned point is worst known, and what one more pose like these would gain. With ``required_m`` (standard
-    deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
+    It names the directions in which positions vary too little, and whether orientations vary. It also names where in
+    the poses' own field a scanned point is worst known, and the gain of one more pose like these. With ``required_m``
+    (standard deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
     """
     used = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     if len(used) < 2:

@@ -419,9 +419,9 @@ def _widened(solution: _Solution) -> Array:
 
     Its Gaussian 95 % region then holds the truth in 95 of 100 calibrations.
 
-    Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
-    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the
-    ratio of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
+    A plain inverse leaves out two things. The weights between positions and normals are estimates too (Kenward and
+    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself). So is the scale (the ratio
+    of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
     """
     inverse = np.linalg.pinv(solution.information)
     N_p = solution.information_p

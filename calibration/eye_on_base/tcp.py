@@ -38,9 +38,9 @@ class TcpOffset:
     """A TCP that the poses seem to carry.
 
     ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z. ``sigma_m`` (3,), infinite
-    where these poses do not show it. ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the
-    residuals, may pretend at most. ``with_m`` and ``without_m`` rms of the centres with and without it. ``probability``
-    that chance alone does as much.
+    where these poses do not show it. ``pretended_m`` (3,) the largest offset that systematic errors of the arm,
+    or of the size of the residuals, could produce. ``with_m`` and ``without_m`` rms of the centres with and without it.
+    ``probability`` that chance alone does as much.
     """
 
     offset_m: Array

@@ -125,9 +125,9 @@ def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | N
 
     None for fewer than four errors.
 
-    From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the
-    coefficient of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees
-    of freedom).
+    It follows from the scatter of the held-out ``errors`` (n,) themselves. Both means have the relative error
+    c / sqrt(n), c the coefficient of variation. The logarithm of their ratio therefore has the variance 2 c^2 / n
+    (Student's t with n - 1 degrees of freedom).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]
@@ -145,9 +145,9 @@ def bootstrap_interval(
 
     None for fewer than four errors.
 
-    From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what
-    comes, and the ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani
-    1993, 13.3).
+    It follows from 4 000 pairs of resamples of the held-out ``errors`` (n,). One of a pair takes the place of the
+    reported errors, the other that of the new ones. The ratio of their quantiles is that of the new to the reported
+    quantile (bootstrap, Efron and Tibshirani 1993, 13.3).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]

@@ -160,8 +160,8 @@ def determinacy(
     """Name the directions that the observations leave open.
 
     ``information`` and ``covariance`` (m, m) of the unknowns; ``length``: extent of the data; ``noise_rad``: per axis.
-    A direction is open where the information vanishes, where its predicted standard deviation exceeds a tenth of a
-    radian or of the extent, or (one rotation axis) where the turns off that axis drown in the rotation noise.
+    A direction is unobservable in three cases. Its information vanishes. Its predicted standard deviation exceeds a
+    tenth of a radian or of the extent. Or, with one rotation axis, the turns off that axis drown in the rotation noise.
     """
     scale = np.tile([1.0, 1.0, 1.0, length, length, length], problem.size // 6)
     N = information * scale[:, None] * scale

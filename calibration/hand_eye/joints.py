@@ -126,10 +126,10 @@ def refine_joints(
 
     ``kind`` is "joints" or "links", which are six numbers a joint.
 
-    Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as
-    a whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and
-    along its axis). Applied only if held-out errors fall, in a paired test on five folds, and not one column at the
-    cost of the other. Otherwise the sentence says that it does not help. ``plain`` is the result of the poses as given.
+    Maximum a posteriori: the prior holds what the poses do not show at zero. A change that only moves the base or the
+    flange as a whole is no error of the robot and is omitted. That is all of the first joint, and turn and shift of the
+    last one about and along its axis. The errors are applied only if both held-out errors fall, in a paired test on
+    five folds. Otherwise the sentence says that they do not help. ``plain`` is the result of the poses as given.
     Raises DatasetError without joint angles, InputError where they do not belong to the arm or the mounting.
     """
     prior, config = prior or JointPrior(), config or HandEyeConfig()

@@ -29,11 +29,11 @@ FORBIDDEN = re.compile(
 )
 # What the source still has of each; a count may only fall. Lower the number when it did.
 CEILINGS = {
-    "first lines that are longer than one line": 1079,
-    "first lines with a forbidden word": 254,
-    "docstring sentences over 30 words": 397,
-    "messages with a sentence over 30 words": 32,
-    "messages with a forbidden word": 82,
+    "first lines that are longer than one line": 41,
+    "first lines with a forbidden word": 42,
+    "docstring sentences over 30 words": 197,
+    "messages with a sentence over 30 words": 10,
+    "messages with a forbidden word": 33,
 }
 
 FENCE = re.compile(r"^(`{3,}|~{3,})[^\n]*\n.*?^\1[ \t]*$", re.MULTILINE | re.DOTALL)
