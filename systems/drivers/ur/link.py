@@ -147,7 +147,7 @@ class UrLink:
         ended = f"It did not answer in {START_LIMIT_S:.0f} s." if code is None else f"It ended with exit code {code}."
         said = link._said()
         link._end()
-        raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" It said: {said}" if said else ""))
+        raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" Its output: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number.
