@@ -41,7 +41,7 @@ def page(
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """A study's table.json; None for a file that is another command's."""
+    """Return a study's table.json; None for a file that is another command's."""
     content = json.loads(path.read_text(encoding="utf-8"))
     return content if isinstance(content, dict) and {"study", "tables", "command"} <= set(content) else None
 
