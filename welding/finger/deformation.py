@@ -208,11 +208,9 @@ def detect_tag(
     quality = picture_quality(grey, sides, cells, error)
     covariance = quality.covariance(position, tag.size_m, K)
     lateral, depth = LIMIT_SIGMAS * np.sqrt([np.linalg.eigvalsh(covariance[:2, :2])[1], covariance[2, 2]])
-    if lateral > bounds.lateral_m or depth > bounds.depth_m:
-        text = (
-            f"The picture of tag {tag.id} may be {1e3 * lateral:.2f} mm off across and {1e3 * depth:.2f} mm in depth: "
-        )
-        return TagObservation(False, text + quality.cause(), None, corners, error, covariance, quality)
+    if quality.blurred or lateral > bounds.lateral_m or depth > bounds.depth_m:
+        text = f"The picture of tag {tag.id} is not sharp and even enough to measure: {quality.cause()}"
+        return TagObservation(False, text, None, corners, error, covariance, quality)
     X_KM = pose(cv2.Rodrigues(r)[0], position)
     return TagObservation(True, "", X_KM, corners, error, covariance, quality)
 

@@ -52,9 +52,14 @@ class PictureQuality:
         along = size / self.size_px * p_KM[2]
         return np.asarray(across**2 * np.diag([1.0, 1.0, 0.0]) + along**2 * np.outer(ray, ray))
 
+    @property
+    def blurred(self) -> bool:
+        """Whether the ends of the profiles lie in the blur: the covariance is too small there."""
+        return self.width > BLURRED
+
     def cause(self) -> str:
         """The likely cause of a large covariance, and what to do."""
-        if self.width > BLURRED:
+        if self.blurred:
             return "its edges are blurred; focus the camera, or shorten the exposure."
         if self.uneven > UNEVEN:
             glare = self.clipped > CLIPPED
