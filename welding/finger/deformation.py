@@ -154,7 +154,7 @@ def detect_tag(
         camera_matrix: (3,3), OpenCV's pixel convention.
         tag: what to look for.
         limits: what to refuse; TagLimits() when None.
-        distortion: OpenCV's coefficients, None for none.
+        distortion: OpenCV's coefficients, by which the picture is rectified first; None for none.
 
     Raises:
         TagError: the image or the camera matrix is invalid.
@@ -163,8 +163,9 @@ def detect_tag(
     K = np.asarray(camera_matrix, dtype=float)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise TagError("The camera matrix must be a finite 3 x 3 array with positive focal lengths.")
-    lens = None if distortion is None else np.asarray(distortion, dtype=float)
     grey = _grey(image)
+    if distortion is not None:  # sides and inner edges are straight in the rectified picture alone
+        grey = np.asarray(cv2.undistort(grey, K, np.asarray(distortion, dtype=float)), dtype=np.uint8)
     hits = _corners(grey, tag)
     if not hits:
         return TagObservation(False, f"Tag {tag.id} is not visible to the finger camera.")
@@ -180,7 +181,7 @@ def detect_tag(
     corners = sides.corners
 
     _, rotations, translations, errors = cv2.solvePnPGeneric(
-        tag.corners_M, corners, K, lens, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        tag.corners_M, corners, K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
     if not rotations:
         return TagObservation(False, f"No pose explains the corners of tag {tag.id}.", None, corners)
@@ -188,11 +189,11 @@ def detect_tag(
     best = int(np.argmin(spread))
     if spread[best] > bounds.max_reprojection_px:
         # Square to the camera to the last pixel, the closed form divides by zero; the iterative one does not.
-        _, start_r, start_p = cv2.solvePnP(tag.corners_M, corners, K, lens, flags=cv2.SOLVEPNP_ITERATIVE)
+        _, start_r, start_p = cv2.solvePnP(tag.corners_M, corners, K, None, flags=cv2.SOLVEPNP_ITERATIVE)
     else:
         start_r, start_p = rotations[best], translations[best]
-    r, p = cv2.solvePnPRefineLM(tag.corners_M, corners, K, lens, start_r.copy(), start_p.copy())
-    predicted, _ = cv2.projectPoints(tag.corners_M, r, p, K, lens)
+    r, p = cv2.solvePnPRefineLM(tag.corners_M, corners, K, None, start_r.copy(), start_p.copy())
+    predicted, _ = cv2.projectPoints(tag.corners_M, r, p, K, None)
     gaps = np.linalg.norm(predicted.reshape(4, 2) - corners, axis=1)
     error = float(np.sqrt(np.mean(gaps**2)))
     position = np.asarray(p, dtype=float).reshape(3)

@@ -18,7 +18,7 @@ SIZE = np.array([1.0, 1.53, 0.44, 0.33, 0.80, 0.09, 0.03])
 FLOOR_PX = 0.005  # of a sharp picture with little noise
 BLURRED = 0.38  # of a profile's reach: from this width on its ends lie in the blur
 BLUR_POWER = 6  # the tails of a blurred edge beyond the profile's end grow so steeply
-UNEVEN = 0.35  # a choice: contrast that differs by this share between places is named as the cause
+UNEVEN = 0.25  # a choice: contrast that differs by this share between places is named as the cause
 CLIPPED = 0.25  # a choice: share of clipped samples at a side that is named as the cause
 SAMPLES, HALF = 8, 10  # profiles of an inner edge, and samples on either side of it
 _INNER = 0.2  # of a cell at either end of an inner edge, left out
@@ -92,7 +92,7 @@ def picture_quality(
     return PictureQuality(
         width=blur,
         clipped=float(sides.clipped.max()),
-        uneven=1.0 - float(sides.contrast.min() / sides.contrast.max()),
+        uneven=1.0 - float(np.divide(*np.quantile(sides.contrast, [0.1, 0.9]))),
         effects_px=np.array(effects),
         size_px=float(np.linalg.norm(sides.corners - np.roll(sides.corners, 1, axis=0), axis=1).mean()),
     )
