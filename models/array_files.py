@@ -1,11 +1,12 @@
 """Reads npz and npy files of plain numbers and words; their headers are checked before anything is expanded."""
 
+import contextlib
 import struct
 import tokenize
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -152,56 +153,51 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, AnyA
     Raises:
         InputError: no regular file, no npz, damaged, an array twice, Python objects, or too large once expanded.
     """
-    try:
-        with opened(path) as stream, zipfile.ZipFile(stream) as archive:
-            members = _members(path, archive)
-            wanted = {k: m for k, m in members.items() if names is None or k in names}
-            numbers = 0
-            for name, member in wanted.items():
-                with archive.open(member) as inside:
-                    numbers += _header(f"'{name}' in {path.name}", inside, member.file_size)[2]
-            _check_expansion(path, numbers, stream)
-            found = {}
-            for name, member in wanted.items():
-                with archive.open(member) as inside:
-                    found[name] = _array(inside, f"'{name}' in {path.name}", member.file_size)
-            return found
-    except InputError:
-        raise
-    except _DAMAGED as e:
-        raise InputError(
-            f"The file {path.name} cannot be read as NPZ: it is not an npz file, or damaged ({type(e).__name__})."
-        ) from e
+    with _undamaged(path, "NPZ"), opened(path) as stream, zipfile.ZipFile(stream) as archive:
+        members = _members(path, archive)
+        wanted = {k: m for k, m in members.items() if names is None or k in names}
+        numbers = 0
+        for name, member in wanted.items():
+            with archive.open(member) as inside:
+                numbers += _header(f"'{name}' in {path.name}", inside, member.file_size)[2]
+        _check_expansion(path, numbers, stream)
+        found = {}
+        for name, member in wanted.items():
+            with archive.open(member) as inside:
+                found[name] = _array(inside, f"'{name}' in {path.name}", member.file_size)
+        return found
 
 
 def read_npy(path: Path) -> AnyArray:
     """The array of an npy file, as stored. Raises InputError as read_npz."""
-    try:
-        with opened(path) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            _check_expansion(path, _header(path.name, stream, size)[2], stream)
-            stream.seek(0)
-            return _array(stream, path.name, size)
-    except InputError:
-        raise
-    except _DAMAGED as e:
-        raise InputError(
-            f"The file {path.name} cannot be read as NPY: it is not an npy file, or damaged ({type(e).__name__})."
-        ) from e
+    with _undamaged(path, "NPY"), opened(path) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        _check_expansion(path, _header(path.name, stream, size)[2], stream)
+        stream.seek(0)
+        return _array(stream, path.name, size)
 
 
 def npy_shape(path: Path) -> tuple[int, ...]:
     """The shape that the header of an npy file states. Raises InputError as read_npz."""
+    with _undamaged(path, "NPY"), opened(path) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        return _header(path.name, stream, size)[0]
+
+
+@contextlib.contextmanager
+def _undamaged(path: Path, kind: str) -> Iterator[None]:
+    """Raise InputError in place of what zipfile, zlib and NumPy raise for damaged files."""
     try:
-        with opened(path) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            return _header(path.name, stream, size)[0]
+        yield
     except InputError:
         raise
     except _DAMAGED as e:
-        raise InputError(f"The file {path.name} cannot be read as NPY ({type(e).__name__}).") from e
+        raise InputError(
+            f"The file {path.name} cannot be read as {kind}: it is not an {kind.lower()} file, or damaged"
+            f" ({type(e).__name__})."
+        ) from e
 
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:

@@ -52,7 +52,7 @@ def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
         raise InputError(f"'{name}' needs more memory than there is: give a smaller file.") from None
     except Exception as e:  # PyYAML and its constructors raise several types; a mark says the line
         raise InputError(f"'{name}' cannot be read as {kind}{_where(e, text)}.") from e
-    _check_size(name, document)
+    _weight(name, document, 0, {})
     return document
 
 
@@ -119,13 +119,11 @@ def _check_events(name: str, text: str) -> None:
             raise _too_much(name)
 
 
-def _check_size(name: str, document: Any) -> None:
-    """An alias of an alias ... of YAML is a small text and an endless document."""
-    _weight(name, document, 0, {})
-
-
 def _weight(name: str, value: Any, level: int, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
-    """Values and levels of a document, aliases in full; each part is looked at once."""
+    """Values and levels of a document, aliases in full; each part is looked at once.
+
+    An alias of an alias ... of YAML is a small text and an endless document.
+    """
     if not isinstance(value, Mapping | list | tuple):
         return 1, 1
     if id(value) in known or level > DEEPEST:
@@ -149,8 +147,10 @@ def _too_much(name: str) -> InputError:
 
 @dataclass(frozen=True)
 class DocumentSection:
-    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or
-    wrong."""
+    """A mapping of a document.
+
+    Its getters raise InputError naming ``file`` and key where a value is missing or wrong.
+    """
 
     file: str
     values: Mapping[Any, Any]
@@ -252,8 +252,10 @@ class DocumentSection:
 
 
 def as_number(value: Any) -> float:
-    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false
-    included."""
+    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text).
+
+    NaN for anything else, true and false included.
+    """
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -1,5 +1,7 @@
-"""Opens a file that an operator hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a
-sentence."""
+"""Opens a file that an operator hands in: a regular file of bounded size, text in UTF-8.
+
+Anything else is refused by a sentence.
+"""
 
 import hashlib
 import os
@@ -47,8 +49,9 @@ _TIMES = 10
 
 
 def expansion_limit(size: int) -> int:
-    """Bytes to which a file of this size (bytes) may expand as double-precision numbers: 256 MiB, or ten times its
-    size.
+    """Bytes to which a file of this size (bytes) may expand as double-precision numbers.
+
+    256 MiB, or ten times its size.
 
     The largest of today's area scanners (8 megapixels) takes 190 MB; a file that is not compressed never exceeds ten
     times.

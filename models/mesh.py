@@ -154,7 +154,7 @@ class TriMesh:
         f = "\n".join(f"f {a}//{k} {b}//{k} {c}//{k}" for k, (a, b, c) in enumerate(faces, start=1))
         return f"{v}\n{vn}\n{f}\n"
 
-    def to_drake(self, hint: str = "weldcal mesh") -> Mesh:
+    def to_drake(self, hint: str) -> Mesh:
         """The mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
         from pydrake.geometry import InMemoryMesh, Mesh
 
@@ -199,25 +199,23 @@ def inside_loops(points: Floats, loops: list[Floats]) -> npt.NDArray[np.bool_]:
     return inside
 
 
-def triangulate_polygon(outline: Floats, holes: list[Floats] | None = None, interior: Floats | None = None) -> Ints:
-    """Triangles (M,3), counter-clockwise, over the stacked points [outline, *holes, interior] of a polygon with holes.
+def triangulate_polygon(outline: Floats, holes: list[Floats] | None = None) -> Ints:
+    """Triangles (M,3), counter-clockwise, over the stacked points [outline, *holes] of a polygon with holes.
 
     Delaunay triangles with centroids inside; no point is added, so neighbouring faces stay watertight. Raises
     InputError where a boundary edge is not in the triangulation: the outline must be sampled finer there.
     """
     loops = [np.asarray(part, dtype=np.float64) for part in (outline, *(holes or []))]
-    extra = np.zeros((0, 2)) if interior is None else np.asarray(interior, dtype=np.float64)
-    return _triangulated(tuple(loop.tobytes() for loop in loops), extra.tobytes()).copy()
+    return _triangulated(tuple(loop.tobytes() for loop in loops)).copy()
 
 
 @lru_cache(maxsize=16)
-def _triangulated(outlines: tuple[bytes, ...], interior: bytes) -> Ints:
+def _triangulated(outlines: tuple[bytes, ...]) -> Ints:
     """`triangulate_polygon` of points as bytes: a cell makes the same flange and the same plate several times."""
     from scipy.spatial import Delaunay
 
     loops = [np.frombuffer(part).reshape(-1, 2) for part in outlines]
-    extra = np.frombuffer(interior).reshape(-1, 2)
-    points = np.concatenate([*loops, extra])
+    points = np.concatenate(loops)
     scaled = (points - points.mean(axis=0)) / np.ptp(points, axis=0).max()
     triangles = Delaunay(scaled).simplices.astype(np.int64)
     a, b, c = (scaled[triangles[:, k]] for k in range(3))
@@ -270,10 +268,11 @@ def wall(loop: Floats, z_low_m: float, z_high_m: float) -> TriMesh:
     return grid(np.stack([low, high], axis=1), close_rows=True)
 
 
-def revolve(profile: Floats, segments: int, *, closed: bool = False) -> TriMesh:
+def revolve(profile: Floats, segments: int) -> TriMesh:
     """The surface of a profile (N,2) of (radius, z) turned about z; material lies to the left of the profile's travel.
 
-    A profile from axis to axis, or a closed one, gives a watertight mesh; points on the axis become one vertex.
+    A profile from axis to axis, or one that ends where it begins, gives a watertight mesh; points on the axis become
+    one vertex.
     """
     profile = np.asarray(profile, dtype=np.float64)
     if (profile[:, 0] < 0.0).any():
@@ -281,7 +280,7 @@ def revolve(profile: Floats, segments: int, *, closed: bool = False) -> TriMesh:
     unit = circle(1.0, segments)
     ring = profile[:, None, :1] * unit[None]
     points = np.concatenate([ring, np.broadcast_to(profile[:, None, 1:], (*ring.shape[:2], 1))], axis=2)
-    surface = grid(np.swapaxes(points, 0, 1), close_rows=True, close_columns=closed)
+    surface = grid(np.swapaxes(points, 0, 1), close_rows=True)
     return merge(surface, tolerance_m=1e-9)
 
 

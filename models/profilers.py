@@ -57,8 +57,10 @@ def make_scene(mesh: TriMesh) -> Any:
 
 
 def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: ProfilerPreset) -> Floats:
-    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m; NaN: nothing in
-    range."""
+    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m.
+
+    NaN: nothing in range.
+    """
     from weldcal.models.mesh import o3d  # slow to import
 
     x = preset.x_m

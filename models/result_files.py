@@ -33,8 +33,10 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_apart(path: Path, content: str | bytes) -> None:
-    """Write a file that is whole by itself, as ``write_atomic`` does: it does not make its folder an unfinished
-    result."""
+    """Write a file that is whole by itself, as ``write_atomic`` does.
+
+    It does not make its folder an unfinished result.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, content.encode() if isinstance(content, str) else content)
 

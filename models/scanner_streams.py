@@ -18,8 +18,9 @@ from weldcal.models.errors import InputError
 
 
 def mixed_exposure(stack: Depth, edge_step_m: float, flying: float, rng: np.random.Generator) -> Depth:
-    """The depth map (H, W) m of an exposure of which ``stack`` (n, H, W) holds the instants, infinite or 0 where
-    nothing is.
+    """Mix the instants ``stack`` (n, H, W) of an exposure to one depth map (H, W) m.
+
+    They are infinite or 0 where nothing is.
 
     Depths further apart than ``edge_step_m`` are two surfaces; such a pixel reads one of them, by its share of the
     exposure, or with chance ``flying`` the mean. 0 marks "no reading".

@@ -37,8 +37,11 @@ class Placed:
 
 @dataclass(frozen=True, kw_only=True)
 class ToolShape:
-    """A drawn body of a tool, on the flange: ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule
-    (likewise), sphere (radius) or mesh (none: vertices and triangles are those of the file)."""
+    """A drawn body of a tool, on the flange.
+
+    ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule (likewise), sphere (radius) or mesh (none:
+    vertices and triangles are those of the file).
+    """
 
     name: str
     kind: str
@@ -50,8 +53,10 @@ class ToolShape:
 
 
 class Seat(NamedTuple):
-    """A loaded tip against a hard ball in the same groove, m: how far towards the wall it leans on, and how far
-    below."""
+    """A loaded tip against a hard ball in the same groove, m.
+
+    How far towards the wall it leans on, and how far below.
+    """
 
     aside_m: float
     below_m: float
@@ -147,11 +152,6 @@ class WeldingTool:
         return Seat((into_left - into_right) / (2.0 * c), (into_left + into_right) / (2.0 * s))
 
     @property
-    def seat_side_m(self) -> float:
-        """How far a loaded tip's centre lies to the left of the groove's middle, m."""
-        return self.seat.aside_m
-
-    @property
     def seat_sink_m(self) -> float:
         """How far a loaded tip's centre lies below a hard ball's in the same groove, m."""
         return self.seat.below_m
@@ -219,11 +219,12 @@ class WeldingTool:
         return straight if X_TM.IsNearlyEqualTo(straight, 1e-12) else X_TM
 
     def drawn(self) -> tuple[ToolShape, ...]:
-        """The bodies on the flange, besides ring, finger and tag: those of the tool's file, or those of the welding
-        tool."""
-        return self.shapes if self.shapes is not None else self._own_shapes()
+        """The bodies on the flange, besides ring, finger and tag.
 
-    def _own_shapes(self) -> tuple[ToolShape, ...]:
+        Those of the tool's file, or those of the welding tool.
+        """
+        if self.shapes is not None:
+            return self.shapes
         t, r, camera_z = self.plate_thickness_m, self.ring_offset_m, float(self.X_FK.translation()[2])
         p_FW = self.X_FT @ self.p_TW
         x, length = float(p_FW[0]), float(p_FW[2]) - 0.012 - t

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
+from weldcal.models.arms.kinematics import ArmModel, joint_frames, known_arms, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
@@ -25,8 +25,10 @@ _MAX_STEP_RAD = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Chain:
-    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis;
-    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s."""
+    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis.
+
+    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s.
+    """
 
     name: str
     joint_names: tuple[str, ...]
@@ -53,8 +55,9 @@ def is_urdf(name: str) -> bool:
 
 
 def load_chain(name: str, kinematics: Path | None = None) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain; ``kinematics``: the file of one Universal Robots arm (see
-    load_arm).
+    """The arm of that name, or of a URDF file, as a chain.
+
+    ``kinematics``: the file of one Universal Robots arm (see load_arm).
 
     Raises InputError naming the known ones, where its file is not one, or for ``kinematics`` of another arm.
     """
@@ -108,7 +111,7 @@ def chain_of(arm: ArmModel) -> Chain:
 
 def chain_forward(chain: Chain, q: ArrayLike) -> RigidTransform:
     """Flange pose X_BF at joint angles q (n,) rad."""
-    X = chain_frames(chain, np.asarray(q, dtype=float))[-1] @ chain.X_LF
+    X = joint_frames(chain.stack, np.asarray(q, dtype=float))[-1] @ chain.X_LF
     return RigidTransform(RotationMatrix(X[:3, :3]), X[:3, 3])
 
 
@@ -125,9 +128,11 @@ def chain_poses(chain: Chain, q: Array) -> Array:
 
 
 def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
-    """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq.
-    3.30)."""
-    X = chain_frames(chain, np.asarray(q, dtype=float))
+    """Geometric Jacobian (6, n) of the flange.
+
+    [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30).
+    """
+    X = joint_frames(chain.stack, np.asarray(q, dtype=float))
     p = (X[-1] @ chain.X_LF)[:3, 3]
     z = X[:, :3, 2]
     return np.vstack([z.T, np.cross(z, p - X[:, :3, 3]).T])
@@ -174,20 +179,9 @@ def _descend(chain: Chain, goal: Array, start: Array) -> Array | None:
 
 
 def _error(chain: Chain, goal: Array, q: Array) -> Array:
-    X = chain_frames(chain, q)[-1] @ chain.X_LF
+    X = joint_frames(chain.stack, q)[-1] @ chain.X_LF
     turn = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(goal[:3, :3] @ X[:3, :3].T)).ToAngleAxis()
     return np.concatenate([turn.axis() * turn.angle(), goal[:3, 3] - X[:3, 3]])
-
-
-def chain_frames(chain: Chain, q: Array) -> Array:
-    """Poses (n, 4, 4) of the joints in B, turned by q."""
-    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
-    step = chain.stack.copy()
-    x, y = chain.stack[:, :, 0], chain.stack[:, :, 1]
-    step[:, :, 0], step[:, :, 1] = x * c + y * s, y * c - x * s
-    for i in range(1, chain.n):
-        step[i] = step[i - 1] @ step[i]
-    return step
 
 
 def _pose(row: dict[str, Any]) -> Array:

@@ -9,7 +9,6 @@ factory calibration has the same schema as the nominal numbers, so nothing else 
 from __future__ import annotations
 
 import importlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.models.arrays import Array
-from weldcal.models.documents import read_document
+from weldcal.models.documents import as_number, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER
 
@@ -200,13 +199,13 @@ def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, s
 
 def forward_kinematics(arm: ArmModel, q: ArrayLike) -> RigidTransform:
     """Flange pose X_BF at joint angles q (6,) rad; at 500 Hz use `kinematics_and_jacobian`, which builds no object."""
-    X = _chain(arm.stack, np.asarray(q, dtype=np.float64))[5]
+    X = joint_frames(arm.stack, np.asarray(q, dtype=np.float64))[5]
     return _rigid(X[:3, :3], X[:3, 3])
 
 
 def link_frames(arm: ArmModel, q: ArrayLike) -> list[RigidTransform]:
     """Poses in B of the seven links of `arm.link_names` at q (6,) rad: the base (identity) first, the flange F last."""
-    chain = _chain(arm.stack, np.asarray(q, dtype=np.float64))
+    chain = joint_frames(arm.stack, np.asarray(q, dtype=np.float64))
     return [_drake().RigidTransform(), *(_rigid(X[:3, :3], X[:3, 3]) for X in chain)]
 
 
@@ -225,7 +224,7 @@ def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> t
     J is geometric: column i is [z_i; z_i x (p_P - o_i)] with z_i, o_i the axis and origin of joint i
     (Siciliano et al., Robotics, 2009, Eq. 3.30, with rotation first as Drake orders spatial vectors).
     """
-    X = _chain(arm.stack, q)
+    X = joint_frames(arm.stack, q)
     R = X[5, :3, :3]
     p = R @ p_FP + X[5, :3, 3]
     z0, z1, z2 = z = X[:, :3, 2].T
@@ -249,14 +248,14 @@ def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
     return float(np.linalg.svd(scaled, compute_uv=False)[-1])
 
 
-def _chain(stack: Array, q: Array) -> Array:
-    """Poses (6, 4, 4) of the six links in B."""
+def joint_frames(stack: Array, q: Array) -> Array:
+    """Poses (n, 4, 4) in B of the joints of a chain, turned by q (n,) rad: ``stack`` is each in its parent at zero."""
     c, s = np.cos(q)[:, None], np.sin(q)[:, None]
     x, y = stack[:, :, 0], stack[:, :, 1]
     step = stack.copy()
     step[:, :, 0] = x * c + y * s
     step[:, :, 1] = y * c - x * s
-    for i in range(1, 6):
+    for i in range(1, len(step)):
         step[i] = step[i - 1] @ step[i]
     return step
 
@@ -267,7 +266,7 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
     A slide along z_i commutes with the rotation about z_i, so X_{i-1,i} RotZ(q_i) may be split on either side of it.
     """
     zero = np.zeros(6)
-    X, X_nominal = _chain(stack, zero), _chain(nominal, zero)
+    X, X_nominal = joint_frames(stack, zero), joint_frames(nominal, zero)
     slide = np.einsum("ij,ij->i", X[:, :3, 2], X_nominal[:, :3, 3] - X[:, :3, 3])
     slide[5] = 0.0
     out = stack.copy()
@@ -279,7 +278,7 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
 def _require_same_arm(stack: Array, nominal: Array, name: str, source: str, advice: str) -> None:
     """Raise InputError where the calibrated flange strays far from the nominal one in some fixed set of postures."""
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
-    shift = max(float(np.linalg.norm((_chain(stack, q) - _chain(nominal, q))[5, :3, 3])) for q in postures)
+    shift = max(float(np.linalg.norm((joint_frames(stack, q) - joint_frames(nominal, q))[5, :3, 3])) for q in postures)
     if not shift <= MAX_CALIBRATION_SHIFT_M:
         raise InputError(f"{source} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: {advice}.")
 
@@ -318,10 +317,7 @@ def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) ->
     value: Any = section
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = as_number(value)
     if not abs(number) <= LARGEST_NUMBER:
         where = f"{path.name}: " if path else ""
         raise InputError(f"{where}{'.'.join(keys)} must be a finite number, it is {value!r}.")
@@ -341,8 +337,10 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
 
 @cache
 def _drake() -> Any:
-    """pydrake.math, imported at the first call: the process that supervises a robot has an ArmModel and no use for
-    it."""
+    """pydrake.math, imported at the first call.
+
+    The process that supervises a robot has an ArmModel and no use for it.
+    """
     return importlib.import_module("pydrake.math")
 
 

@@ -109,8 +109,10 @@ def arm_urdf(arm: ArmModel, model_name: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Radii of an arm's housings, and its size by joint relative to the UR10e: lengths of housings grow with their
-    radii."""
+    """Radii of an arm's housings, and its size by joint relative to the UR10e.
+
+    Lengths of housings grow with their radii.
+    """
 
     big: float
     mid: float
@@ -301,11 +303,12 @@ def link_solids(arm: ArmModel, link: int) -> list[TriMesh]:
     """
     for element in ET.fromstring(arm_urdf(arm)).iter("link"):
         if element.get("name") == arm.link_names[link]:
-            return [_placed(visual) for visual in element.iter("visual")]
+            return [placed_solid(visual) for visual in element.iter("visual")]
     return []
 
 
-def _placed(visual: ET.Element) -> TriMesh:
+def placed_solid(visual: ET.Element) -> TriMesh:
+    """The closed solid of a visual element of arm_urdf, in its link's frame, m."""
     origin, geometry = visual.find("origin"), visual.find("geometry")
     assert origin is not None
     assert geometry is not None

@@ -22,8 +22,11 @@ _PICTURES = ("visual", "collision")
 
 
 class UrdfChain(NamedTuple):
-    """Joints from base to flange: names, ``stack`` (n, 4, 4) pose of each in its parent at zero (its z the axis),
-    flange in the last joint's frame (4, 4), limits (n,) rad and rad/s."""
+    """Joints from base to flange.
+
+    Names, ``stack`` (n, 4, 4) pose of each in its parent at zero (its z the axis), flange in the last joint's frame (4,
+    4), limits (n,) rad and rad/s.
+    """
 
     joint_names: tuple[str, ...]
     stack: Array

@@ -1,5 +1,7 @@
-"""The file that `weldcal finger calibrate` writes, and pictures rectified by it: those of a pinhole camera without
-distortion."""
+"""The file that `weldcal finger calibrate` writes, and pictures rectified by it.
+
+Those of a pinhole camera without distortion.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +21,10 @@ SCHEMA = 1
 
 @dataclass(frozen=True, eq=False)
 class FingerFile:
-    """Picture size, K (3, 3) px, OpenCV's distortion coefficients, and the tag's measured side in m (None: not
-    measured)."""
+    """Hold what a finger file states.
+
+    Picture size, K (3, 3) px, OpenCV's distortion coefficients, and the tag's measured side in m (None: not measured).
+    """
 
     width: int
     height: int

@@ -3,6 +3,7 @@
 import dataclasses as dc
 from dataclasses import dataclass, field
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,11 @@ REQUIRED = ("mass_kg", "centre_of_gravity_mm", "tip", "torch", "finger_camera", 
 """Keys that a tool file must have; of tip, torch, finger_camera and tag, xyz_mm."""
 
 
+POSITIVE = (
+    *("mass_kg", "tip.radius_mm", "tip.modulus_MPa", "tip.lateral_stiffness_N_per_mm", "tip.axial_stiffness_N_per_mm"),
+    *("tip.damping_N_s_per_m", "tip.mass_kg", "tip.finger_radius_mm", "tag.size_mm", "tag.plate_mm"),
+    *("tag.membrane_mm", "finger_camera.focal_px", "finger_camera.width", "finger_camera.height"),
+)
 LEAST_CHORD_M = 0.010  # the servo steers by the line from torch to tip
 WELDING = Path(__file__).resolve().parent / "welding.yaml"
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
@@ -145,8 +151,11 @@ _SIZES = ("box_mm", "cylinder_mm", "capsule_mm", "sphere_mm", "mesh")
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class LoadedTool:
-    """A tool of a file: the tool, its camera's picture size and focal length, its finger calibration's path (""
-    without), and the pose X_FW of the torch (z along the wire)."""
+    """A tool of a file.
+
+    The tool, its camera's picture size and focal length, its finger calibration's path ("" without), and the pose X_FW
+    of the torch (z along the wire).
+    """
 
     name: str
     file: Path
@@ -285,23 +294,8 @@ def _placed(xyz_mm: Triple, rpy_deg: Triple) -> Placed:
 
 
 def _check_sizes(file: str, part: ToolPart) -> None:
-    positive = {
-        "mass_kg": part.mass_kg,
-        "tip.radius_mm": part.tip.radius_mm,
-        "tip.modulus_MPa": part.tip.modulus_MPa,
-        "tip.lateral_stiffness_N_per_mm": part.tip.lateral_stiffness_N_per_mm,
-        "tip.axial_stiffness_N_per_mm": part.tip.axial_stiffness_N_per_mm,
-        "tip.damping_N_s_per_m": part.tip.damping_N_s_per_m,
-        "tip.mass_kg": part.tip.mass_kg,
-        "tip.finger_radius_mm": part.tip.finger_radius_mm,
-        "tag.size_mm": part.tag.size_mm,
-        "tag.plate_mm": part.tag.plate_mm,
-        "tag.membrane_mm": part.tag.membrane_mm,
-        "finger_camera.focal_px": part.finger_camera.focal_px,
-        "finger_camera.width": part.finger_camera.width,
-        "finger_camera.height": part.finger_camera.height,
-    }
-    for key, value in positive.items():
+    for key in POSITIVE:
+        value = attrgetter(key)(part)
         if value <= 0.0:
             raise InputError(f"'{file}': {key} must be positive, and it is {value:g}.")
     for key, axis in (("tip.axis", part.tip.axis), ("torch.axis", part.torch.axis)):
@@ -319,8 +313,10 @@ def _check_sizes(file: str, part: ToolPart) -> None:
 
 
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
-    """R_FT (z_T against the finger's axis, x_T from the torch to the tip), and the torch point (-chord, 0, height) in
-    T, m."""
+    """Compute R_FT, and the torch point (-chord, 0, height) in T, m.
+
+    z_T points against the finger's axis, x_T from the torch to the tip.
+    """
     z = -_unit(part.tip.axis)
     to_tip = (np.array(part.tip.xyz_mm) - np.array(part.torch.xyz_mm)) / 1e3
     level = to_tip - (to_tip @ z) * z

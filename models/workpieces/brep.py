@@ -1,5 +1,7 @@
-"""Faces and solids, OpenCascade's own or regions of a closed mesh: normals, nearest points and what is inside; lengths
-in mm."""
+"""Faces and solids, OpenCascade's own or regions of a closed mesh: normals, nearest points and what is inside.
+
+Lengths in mm.
+"""
 
 from __future__ import annotations
 
@@ -121,8 +123,10 @@ class SolidFace:
         return None
 
     def foot(self, p: Floats) -> Floats:
-        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its
-        vicinity."""
+        """The point of the face that is nearest to a point.
+
+        Of a bent face one at which the distance is least in its vicinity.
+        """
         if (over := self._over(p)) is not None:
             return over
         curves, starts, chords, parameters, of = self._border
@@ -186,8 +190,10 @@ class MeshFace(SolidFace):
     """A region of a closed mesh that is a plane or a cylinder; any other has no surface."""
 
     def __init__(self, triangles: Floats, fit: tuple[Floats, Floats, float] | None) -> None:
-        """Take its triangles (M,3,3) with their normals out of the material, and its plane or cylinder (see
-        `mesh_files.regions`)."""
+        """Take its triangles (M,3,3) with their normals out of the material, and its plane or cylinder.
+
+        See `mesh_files.regions`.
+        """
         self.triangles, self.fit = triangles, fit
         self.low, self.high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self.edges: list[Any] = []  # the body adds them
@@ -382,9 +388,7 @@ def _end_of(face: SolidFace, edge: Any) -> tuple[Floats, Floats, Floats] | None:
         straight if face.flat else curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
     ):
         return None
-    point, along = gp_Pnt(), gp_Vec()
-    curve.D1(0.5 * (curve.FirstParameter() + curve.LastParameter()), point, along)
-    p, t = array_of(point), unit(array_of(along))
+    p, t, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
     n = face.normal(p)
     m = np.cross(t, n)
     inner = face.foot(p + IN_MM * m)

@@ -196,8 +196,10 @@ def _fits(opening: Opening, joint: str) -> bool:
 
 
 def _chosen(section: Section, joint: str, wanted: Floats) -> tuple[Opening, Floats, float] | None:
-    """The joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap; None without
-    one."""
+    """The joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap.
+
+    None without one.
+    """
     aim = np.array([wanted @ section.right, wanted @ section.up])
     for radius in PROBES_M:
         found = [o for o in openings(section, radius) if _fits(o, joint) and o.middle @ aim > 0.3]

@@ -78,8 +78,9 @@ def joints_of(shape: Any) -> list[list[Piece]]:
 
 
 def joints_between(bodies: Sequence[Solid]) -> list[list[Piece]]:
-    """The joints between bodies, and where there are none those inside each of them, each as its pieces in the order of
-    travel.
+    """Find the joints between bodies, and where there are none those inside each of them.
+
+    Each is the list of its pieces in the order of travel.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece
     may end; each stretch between two crossings is a joint or is none.

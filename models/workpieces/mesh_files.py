@@ -70,8 +70,10 @@ def _shared(mesh: TriMesh) -> tuple[Ints, Ints]:
 
 
 def _chained(vertices: Floats, pairs: Ints, turn: Floats) -> list[tuple[Floats, float]]:
-    """Lines (N,3) through edges that follow each other without a corner, with the median angle between the faces'
-    normals."""
+    """Chain edges that follow each other without a corner to lines (N,3).
+
+    With the median angle between the faces' normals.
+    """
     around: dict[int, list[int]] = {}
     for k, (a, b) in enumerate(pairs.tolist()):
         around.setdefault(a, []).append(k)
@@ -157,8 +159,9 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
 
 
 def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
-    """The mesh with corners of its own for each body, and the body (M,) of each triangle: bodies that touch share no
-    corner.
+    """The mesh with corners of its own for each body, and the body (M,) of each triangle.
+
+    Bodies that touch share no corner.
 
     Most programs write one body after another: each ends where all the edges since its beginning are met from both
     sides. A body that is written twice counts once.
@@ -190,8 +193,10 @@ def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
 
 
 def _apart(mesh: TriMesh) -> Ints:
-    """The body (M,) of each triangle where bodies may touch in an edge: two of more triangles at it bound the same
-    material."""
+    """The body (M,) of each triangle where bodies may touch in an edge.
+
+    Two of more triangles at it bound the same material.
+    """
     t, n = mesh.triangles, len(mesh.vertices)
     edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
     apex, owner = np.concatenate([t[:, 2], t[:, 0], t[:, 1]]), np.tile(np.arange(len(t)), 3)
@@ -321,8 +326,10 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
 def _cylinder(
     seed: int, other: int, points: list[Floats], middle: list[Floats], near: list[set[int]], taken: Ints
 ) -> tuple[list[int], tuple[Floats, Floats, float]] | None:
-    """The patches around two that lie on one cylinder, and that: a point, its axis and its radius; None for fewer than
-    four."""
+    """The patches around two that lie on one cylinder, and that: a point, its axis and its radius.
+
+    None for fewer than four.
+    """
     along = np.cross(middle[seed], middle[other])
     if np.linalg.norm(along) < 1e-6:
         return None
@@ -351,8 +358,10 @@ def _cylinder(
 
 
 def _fitted(points: Floats, along: Floats, steps: int) -> tuple[Floats, Floats, float] | None:
-    """The cylinder through points (N,3): a point, its axis and its radius, by least squares in so many steps from a
-    rough axis."""
+    """The cylinder through points (N,3).
+
+    A point, its axis and its radius, by least squares in so many steps from a rough axis.
+    """
     x = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     x /= np.linalg.norm(x)
     y, middle = np.cross(along, x), points.mean(axis=0)

@@ -236,19 +236,25 @@ class Part:
 
     @property
     def depth_m(self) -> float:
-        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the
-        faces."""
+        """From the end of the lower wall to the root, along the bisector.
+
+        Of a gap 0, for its root is level with the faces.
+        """
         return min(self.section.left_m, self.section.right_m) * math.cos(self.half_angle_rad)
 
     @cached_property
     def end_window_m(self) -> float:
-        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not
-        felt."""
+        """See WeldPart; hardly any where the joint goes on beyond the drawn end.
+
+        There the end is chosen, not felt.
+        """
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
     def felt_by(self, tip: SeatedTip) -> bool:
-        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow
-        a gap."""
+        """Whether the tip is used on this seam.
+
+        As the seam's `feel` says, else not where level plates leave too narrow a gap.
+        """
         if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
             return self.seam.feel is not False
         return feels(self.section, tip)
@@ -273,8 +279,10 @@ class Part:
             raise JointNotWeldable(f"{error} {advice}") from error
 
     def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
-        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and
-        searches."""
+        """See WeldPart: a wide joint guides the tip in from above.
+
+        Beside a narrow one it lands on the face and searches.
+        """
         section = self.section
         if not self.felt_by(tip):
             return TipApproach(0.0, GUIDED_DROP_M)
@@ -324,8 +332,9 @@ def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
 
 
 def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
-    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has
-    it.
+    """The part as made, bowed by an amplitude at its middle in a direction (3,).
+
+    Its seam is not where the drawing has it.
 
     A point moves by amplitude cos(pi x) along the direction, x from -1/2 to 1/2 along the seam's chord; the ends stay.
 

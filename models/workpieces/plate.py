@@ -106,7 +106,6 @@ class Workpiece:
     depth_m: float
     path: PlanarPath
     X_PG: RigidTransform
-    corner_radius_m: float
     bend_radius_m: float = math.inf
     up_P: Floats = field(default_factory=lambda: np.array([[0.0, 0.0, 1.0]]))
 
@@ -157,10 +156,6 @@ class Workpiece:
     def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the groove in which it then rests: it lands on the face beside it."""
         return TipApproach(-BESIDE_GROOVE_M, self.depth_m + tip.tip_radius_m - seated.above_m)
-
-    def tip_line_P(self, tip_radius_m: float) -> Floats:
-        """(N,3) where the centre of a seated ball of that radius runs, m."""
-        return np.asarray(self.seam_P + self.tip_height(tip_radius_m) * self.up_P)
 
 
 def seeded_groove_error(
@@ -243,7 +238,6 @@ def make_workpiece(
         depth_m=depth_m,
         path=path,
         X_PG=X,
-        corner_radius_m=radius,
     )
 
 

@@ -1,5 +1,7 @@
-"""Reads what a user says of a seam: a polyline in a CSV file or numbered edges of the part, its direction and its
-ends."""
+"""Reads what a user says of a seam.
+
+A polyline in a CSV file or numbered edges of the part, its direction and its ends.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,10 @@ MOST_SEAM_POINTS = 200_000
 
 @dataclass(frozen=True)
 class SeamSource:
-    """Where a seam comes from: `polyline`, a CSV file, or `edges`, numbers of the part; its direction and its ends,
-    m."""
+    """Where a seam comes from: `polyline`, a CSV file, or `edges`, numbers of the part.
+
+    Its direction and its ends, m.
+    """
 
     polyline: Path | None = None
     edges: tuple[int, ...] = ()

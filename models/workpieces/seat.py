@@ -54,8 +54,11 @@ class Press(NamedTuple):
 
 
 class TipApproach(NamedTuple):
-    """How the tip is brought into a joint, m: how far to the left of the root it comes down (negative: to the right),
-    and how much lower it then rests in the joint than where it lands."""
+    """How the tip is brought into a joint, m.
+
+    How far to the left of the root it comes down (negative: to the right), and how much lower it then rests in the
+    joint than where it lands.
+    """
 
     aside_m: float
     drop_m: float
@@ -101,8 +104,10 @@ def contact_angle(section: JointSection, radius_m: float) -> float:
 
 
 def hard_height(section: JointSection, radius_m: float) -> float:
-    """Height of a hard ball's centre above the root, m: radius / sin(half angle), over a gap sqrt(radius^2 -
-    (gap/2)^2)."""
+    """Height of a hard ball's centre above the root, m.
+
+    Radius / sin(half angle), over a gap sqrt(radius^2 - (gap/2)^2).
+    """
     if section.gap_m > 0.0:
         return math.sqrt(max(0.0, radius_m**2 - (0.5 * section.gap_m) ** 2))
     return radius_m / math.sin(section.half_angle_rad)

@@ -41,8 +41,10 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The free space between two walls, seen from one point of a cut: angles from x towards y, rad, and the walls'
-    normals."""
+    """The free space between two walls, seen from one point of a cut.
+
+    Angles from x towards y, rad, and the walls' normals.
+    """
 
     low_rad: float
     high_rad: float
@@ -111,12 +113,12 @@ def _distance(a: Floats, d: Floats) -> Floats:
     return np.asarray(np.hypot(nearest[:, 0], nearest[:, 1]))
 
 
-def crossings(section: Section, centre: Floats, radius: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Where a circle meets the outline: angles (K,) ascending, points (K,2), normals (K,2), and -1 or 1 (K,).
+def crossings(section: Section, radius: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Find where a circle about the origin meets the outline: angles (K,), points (K,2), normals (K,2), signs (K,).
 
-    The last is 1 where a turn from x towards y enters the material.
+    The angles ascend. A sign is 1 where a turn from x towards y enters the material, else -1.
     """
-    a, d = section.segments[:, 0] - centre, section.segments[:, 1] - section.segments[:, 0]
+    a, d = section.segments[:, 0], section.segments[:, 1] - section.segments[:, 0]
     qa, qb, qc = np.vecdot(d, d), np.vecdot(a, d), np.vecdot(a, a) - radius**2
     root = qb * qb - qa * qc
     share = (_BOTH * np.sqrt(np.maximum(root, 0.0)) - qb) / qa
@@ -128,17 +130,16 @@ def crossings(section: Section, centre: Floats, radius: float) -> tuple[Floats, 
     points, index, angle = points[order], index[order], angle[order]
     normals = section.normals[index]
     enters = np.where(normals[:, 1] * points[:, 0] < normals[:, 0] * points[:, 1], 1.0, -1.0)
-    return angle, points + centre, normals, enters
+    return angle, points, normals, enters
 
 
-def openings(section: Section, radius: float, centre: Floats | None = None) -> list[Opening]:
-    """Every free space about a point of the cut (the seam's own where None), between walls met at this distance.
+def openings(section: Section, radius: float) -> list[Opening]:
+    """Every free space about the seam's point of the cut, between walls met at this distance.
 
     Material is counted by its surfaces, so bodies may touch or overlap: between two bodies' common faces nothing is
     free.
     """
-    middle = np.zeros(2) if centre is None else centre
-    angle, points, normals, enters = crossings(section, middle, radius)
+    angle, points, normals, enters = crossings(section, radius)
     if len(angle) < 2:
         return []
     depth = np.cumsum(enters)

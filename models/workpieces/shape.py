@@ -13,7 +13,6 @@ from weldcal.models.mesh import TriMesh
 Floats = npt.NDArray[np.float64]
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
-KINDS = ("concave", "flush", "convex", "smooth", "boundary")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +75,10 @@ class PartJoint:
 
 @dataclass(frozen=True, eq=False)
 class PartShape:
-    """A part in its frame P, m: its mesh, its edges by ascending id, the file's unit in m, its bodies and its
-    joints."""
+    """A part in its frame P, m.
+
+    Its mesh, its edges by ascending id, the file's unit in m, its bodies and its joints.
+    """
 
     name: str
     mesh: TriMesh

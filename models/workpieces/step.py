@@ -154,25 +154,20 @@ def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
     from OCP.BRep import BRep_Tool
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
-    from OCP.TopExp import TopExp_Explorer
     from OCP.TopLoc import TopLoc_Location
     from OCP.TopoDS import TopoDS
 
-    explorer = TopExp_Explorer(shape, TopAbs_ShapeEnum.TopAbs_SOLID)
-    bodies = 0
-    while explorer.More():
-        bodies += 1
-        explorer.Next()
+    from weldcal.models.workpieces.brep import parts_of
+
+    bodies = len(parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID))
     if not bodies:
         raise InputError(
             f"'{path.name}' holds no solid (only surfaces or lines): close it to a solid and export it again."
         )
     BRepMesh_IncrementalMesh(shape, CHORD_MM, False, FACET_RAD, False)
     pieces = []
-    explorer = TopExp_Explorer(shape, TopAbs_ShapeEnum.TopAbs_FACE)
-    while explorer.More():
-        face, location = TopoDS.Face(explorer.Current()), TopLoc_Location()
-        explorer.Next()
+    for found in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE):
+        face, location = TopoDS.Face(found), TopLoc_Location()
         triangulation = BRep_Tool.Triangulation_s(face, location)
         if triangulation is None:
             continue

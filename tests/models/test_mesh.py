@@ -52,7 +52,7 @@ def test_a_revolved_rectangle_is_a_closed_cylinder() -> None:
 
 
 def test_a_closed_profile_makes_a_closed_ring() -> None:
-    mesh = revolve(np.array([(0.1, 0.0), (0.2, 0.0), (0.2, 0.1), (0.1, 0.1)]), 90, closed=True)
+    mesh = revolve(np.array([(0.1, 0.0), (0.2, 0.0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.0)]), 90)
     assert mesh.watertight()
     assert mesh.volume == pytest.approx((_polygon_area(0.2, 90) - _polygon_area(0.1, 90)) * 0.1, rel=1e-12)
 

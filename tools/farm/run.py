@@ -97,8 +97,9 @@ class Farm:
         tasks: Mapping[str, Mapping[str, Any]],
         each: Callable[[dict[str, Result]], None] | None = None,
     ) -> dict[str, Result]:
-        """Call a module's function once per task with its keyword arguments; the results by task, in the order of
-        ``tasks``.
+        """Call a module's function once per task with its keyword arguments.
+
+        The results by task, in the order of ``tasks``.
 
         Args:
             function: of a module, so that another process finds it; it returns values that JSON can hold.

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
 from weldcal.tools.report.pictures import GREY, OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
-from weldcal.welding.locate.part.fit import into
 from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.planes import into
 
 _SMALL = 8
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
@@ -68,8 +68,7 @@ class WeldTrace:
 
 
 def part_in_scan(points_B: Array, mesh: TriMesh, X_BP: RigidTransform) -> bytes:
-    """Draw where the scan (N,3) m agrees with the drawn part: its surface towards the scan, from above and from two
-    sides."""
+    """Draw where the scan (N,3) m agrees with the drawn part, from above and from two sides."""
     model = PartModel(mesh)
     scan = into(X_BP, points_B[np.isfinite(points_B).all(axis=1)])
     low, high = mesh.bounds

@@ -1,5 +1,7 @@
-"""Makes cells whose flange is small, far or hidden: an arm of drawn housings, a second arm, a table and clutter, by
-rays."""
+"""Makes cells whose flange is small, far or hidden.
+
+An arm of drawn housings, a second arm, a table and clutter, by rays.
+"""
 
 import tempfile
 from collections.abc import Mapping
@@ -12,13 +14,14 @@ import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.eye_on_base.arm_start import arm_shape, find_arm
-from weldcal.models.arms.chain import Chain, chain_frames, chain_inverse, load_chain
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.chain import Chain, chain_inverse, load_chain
+from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
 from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.models.profilers import make_scene
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.report.files import csv_text
 
@@ -72,8 +75,11 @@ radius, m."""
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmCell:
-    """A cell: its arm, true pose of the scanner X_BC, joints (n, k) rad, scans (H, W, 3) m with NaN, flange's
-    designation."""
+    """Hold a cell and its scans.
+
+    Its arm, the true pose of the scanner X_BC, joints (n, k) rad, scans (H, W, 3) m with NaN, and the flange's
+    designation.
+    """
 
     arm: str
     flange: str
@@ -85,7 +91,7 @@ class ArmCell:
 
 def _frames(chain: Chain, q: Array) -> list[Array]:
     """Poses (4, 4) of base, links and flange in B."""
-    frames = [np.eye(4), *chain_frames(chain, q)]
+    frames = [np.eye(4), *joint_frames(chain.stack, q)]
     return [*frames, frames[-1] @ chain.X_LF]
 
 
@@ -103,8 +109,10 @@ def _box(size: Array, X: RigidTransform) -> TriMesh:
 
 
 def arm_links(name: str, rng: np.random.Generator) -> list[TriMesh]:
-    """Bodies of base and links in their frames, m, thicker or thinner than drawn by up to 8 %, with a box and a hose on
-    them."""
+    """Make the bodies of base and links in their frames, m, with a box and a hose on them.
+
+    They are thicker or thinner than drawn by up to 8 %.
+    """
     chain = load_chain(name)
     if name in known_arms():
         arm = load_arm(name)
@@ -145,8 +153,10 @@ def posed(links: list[TriMesh], flange: TriMesh, frames: list[Array]) -> TriMesh
 
 
 def clutter(reach: float, eye: Array, rng: np.random.Generator) -> TriMesh:
-    """A table, boxes, cans and discs of a flange's size on it, none within 0.2 m of B, and a wall that hides nothing
-    from ``eye`` (3,) m."""
+    """Make a table with boxes, cans and discs of a flange's size on it, none within 0.2 m of B.
+
+    And a wall that hides nothing from ``eye`` (3,) m.
+    """
     table = _box(np.array([3.0 * reach, 3.0 * reach, 0.04]), RigidTransform([0.0, 0.0, -0.02 - rng.uniform(0.0, 0.05)]))
     parts = [table]
     for _ in range(int(rng.integers(3, 9))):
@@ -169,16 +179,14 @@ def clutter(reach: float, eye: Array, rng: np.random.Generator) -> TriMesh:
 
 
 def render(mesh: TriMesh, X_BC: RigidTransform, rng: np.random.Generator, sigma: float) -> Array:
-    """A scan (H, W, 3) m with noise that grows with distance and slant, flying pixels, and holes where nothing came
-    back."""
+    """Render a scan (H, W, 3) m with noise that grows with distance and slant, and flying pixels.
+
+    It has holes where nothing came back.
+    """
     u, v = np.meshgrid((np.arange(WIDTH) - 0.5 * WIDTH) / FOCAL, (np.arange(HEIGHT) - 0.5 * HEIGHT) / FOCAL)
     rays_C = np.stack([u, v, np.ones_like(u)], axis=-1)
     d = rays_C @ X_BC.rotation().matrix().T
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(mesh.triangles.astype(np.uint32)),
-    )
+    scene = make_scene(mesh)
     rays = np.concatenate([np.broadcast_to(X_BC.translation(), d.shape), d], axis=-1).astype(np.float32)
     hit = scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), nthreads=1)
     z = hit["t_hit"].numpy().astype(float)
@@ -269,8 +277,10 @@ def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
 
 
 def calibrate_cell(seed: int) -> Mapping[str, object]:
-    """The cell of a seed calibrated without a guess, and the start from three of its scans: "right", "wrong" or
-    "refused" each; "alone" is what it is without the arm."""
+    """The cell of a seed calibrated without a guess, and the start from three of its scans.
+
+    "right", "wrong" or "refused" each; "alone" is what it is without the arm.
+    """
     cell = arm_cell(seed)
     work = np.mean([X.translation() for X in cell.X_BF], axis=0)
 

@@ -63,8 +63,10 @@ Values = Sequence[Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the
-    folder and returns what was read, all numbers of which must be finite where ``finite``."""
+    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``.
+
+    ``read`` takes the folder and returns what was read, all numbers of which must be finite where ``finite``.
+    """
 
     name: str
     kind: str
@@ -215,8 +217,10 @@ class ReaderVerdict:
 
 
 def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, str]:
-    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a
-    file)."""
+    """Damage an example: the example, its damaged files, whether they contradict themselves, and what is there.
+
+    The last is what is there instead of a file, "" for a file.
+    """
     number = READERS.index(reader)
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)

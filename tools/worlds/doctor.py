@@ -109,8 +109,11 @@ def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
 def observe(
     world: DoctorWorld, X_BF: Array, X_BC: Array | None = None, believed: Array | None = None, *, soft: float = 0.0
 ) -> DoctorCase:
-    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft``
-    the distance (m) from which on the image is out of focus (0: nowhere)."""
+    """What the scanner sees of the true flange poses (n, 4, 4).
+
+    ``believed`` is what the controller states, ``soft`` the distance (m) from which on the image is out of focus (0:
+    nowhere).
+    """
     rng, n = world.rng, len(X_BF)
     X_CF = inverse(np.broadcast_to(world.X_BC if X_BC is None else X_BC, (n, 4, 4))) @ X_BF
     c, m = X_CF[:, :3, 3], X_CF[:, :3, 2]
@@ -307,82 +310,9 @@ CAUSES: dict[str, Callable[[int], DoctorCase]] = {
 """What each cause does to a set, by seed."""
 
 
-def _inverted(seed: int) -> DoctorCase:
-    case = clean(seed)
-    return case.with_poses(inverse(case.X_BF))
-
-
-def _euler(seed: int) -> DoctorCase:
-    case = clean(seed)
-    angles = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_euler("ZYX")
-    return case.with_poses(pose(Rotation.from_euler("xyz", angles).as_matrix(), case.X_BF[:, :3, 3]))
-
-
-def _shifted(seed: int) -> DoctorCase:
-    case = clean(seed)
-    return case.pick(np.arange(1, case.n)).with_poses(case.X_BF[:-1])
-
-
-def _mirrored(seed: int) -> DoctorCase:
-    case = clean(seed)
-    flip = np.array([1.0, -1.0, 1.0])
-    return replace(case, c=case.c * flip, m=case.m * flip)
-
-
-def _scale(seed: int) -> DoctorCase:
-    case = clean(seed)
-    return replace(case, c=case.c * (1.03 if seed % 2 else 0.97))
-
-
-def _encoder(seed: int) -> DoctorCase:
-    world = make_world(seed)
-    q = world.q.copy()
-    q[:, 1 + seed % 4] += np.radians(2.5)
-    return observe(world, true_poses(world), believed=chain_poses(world.believed, q))
-
-
-def _shuffled(seed: int) -> DoctorCase:
-    case = clean(seed)
-    return case.with_poses(case.X_BF[np.random.default_rng([seed, 11]).permutation(case.n)])
-
-
-def _random_turns(seed: int) -> DoctorCase:
-    case = clean(seed)
-    R = Rotation.random(case.n, random_state=seed).as_matrix()
-    return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
-
-
-UNKNOWN: dict[str, Callable[[int], DoctorCase]] = {
-    "poses inverted": _inverted,
-    "wrong rotation convention": _euler,
-    "scans and poses shifted by one": _shifted,
-    "scanner axes mirrored": _mirrored,
-    "scanner scale error": _scale,
-    "joint zero off by 2.5 degrees": _encoder,
-    "scans of other poses": _shuffled,
-    "rotations without meaning": _random_turns,
-}
-"""What each does to a set, by seed.
-
-Of the last three no model has the name: "unexplained", or a kinematics file, is right.
-"""
-
-
 FAULTS = ("none", "moved", "drifts", "broken")
 SHARES = (0.7, 0.1, 0.1, 0.1)
-COLUMNS = (
-    "id",
-    "base_x",
-    "base_y",
-    "base_z",
-    "base_qw",
-    "base_qx",
-    "base_qy",
-    "base_qz",
-    "camera_x",
-    "camera_y",
-    "camera_z",
-)
+COLUMNS = ("id", *(f"base_{c}" for c in (*"xyz", "qw", "qx", "qy", "qz")), *(f"camera_{c}" for c in "xyz"))
 HEADER = (
     "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
 )
@@ -413,9 +343,11 @@ def write_cell(folder: Path, fault: str, datasets: int, rng: np.random.Generator
     )
     scale = 1.0 + SCALE * rng.normal()
     waves = rng.normal(size=(3, 3)) * 4.0, rng.uniform(0.0, 2 * np.pi, 3)
-    way = _unit(rng)
+    way = _direction(rng)
     since = int(rng.integers(1, datasets)) if datasets > 1 else 0
-    step = RigidTransform(RollPitchYaw(np.radians(MOVED_DEG) * _unit(rng)), rng.uniform(*MOVED_M) * _unit(rng))
+    step = RigidTransform(
+        RollPitchYaw(np.radians(MOVED_DEG) * _direction(rng)), rng.uniform(*MOVED_M) * _direction(rng)
+    )
     for k in range(datasets):
         X = X_BC
         if fault == "moved" and k >= since:
@@ -444,8 +376,3 @@ def _write_dataset(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "pairs.csv").write_text(csv_text(COLUMNS, rows), encoding="utf-8")
     (folder / "dataset.yaml").write_text(HEADER, encoding="utf-8")
-
-
-def _unit(rng: np.random.Generator) -> Array:
-    v = rng.normal(size=3)
-    return np.asarray(v / np.linalg.norm(v))

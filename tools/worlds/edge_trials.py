@@ -42,8 +42,10 @@ SETS = ("xy_paper", "tilt_paper", "xy_nominal", "tilt_nominal")
 
 
 class EdgeError(NamedTuple):
-    """Error of a calibration: rotation deg, translation mm, normalised error squared of six numbers (NaN without
-    covariance)."""
+    """Error of a calibration.
+
+    Rotation deg, translation mm, normalised error squared of six numbers (NaN without covariance).
+    """
 
     deg: float
     mm: float

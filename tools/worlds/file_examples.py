@@ -37,8 +37,10 @@ def points(rng: Rng, n: int = 60) -> Array:
 
 
 def ply(rng: Rng) -> Files:
-    """Text or binary of either order; coordinates of several types, among other properties, a camera or faces
-    behind."""
+    """Text or binary of either order.
+
+    Coordinates of several types, among other properties, a camera or faces behind.
+    """
     n, kind = 60, str(rng.choice(["ascii", "binary_little_endian", "binary_big_endian"]))
     names = ["x", "y", "z"] + (["intensity"] if rng.random() < 0.5 else [])
     types = [str(rng.choice(["float", "double", "int"])) for _ in names]
@@ -374,8 +376,10 @@ def profiler_blocks(rng: Rng) -> Files:
 
 
 def profiler_heights(rng: Rng) -> Files:
-    """A grid of heights with the x of its columns in the first row, or of its rows in the first column; and their
-    poses."""
+    """A grid of heights with the x of its columns in the first row, or of its rows in the first column.
+
+    And their poses.
+    """
     grid = np.vstack([np.linspace(-20.0, 20.0, 12), rng.uniform(80.0, 120.0, (6, 12))])
     grid[3, 4] = -99999.9999
     rows = grid if rng.random() < 0.5 else grid.T

@@ -16,6 +16,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.models.profilers import make_scene
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
 from weldcal.systems.drivers.simulated.ur import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
@@ -28,8 +29,10 @@ _SEGMENTS = 96  # of bodies that are no flange
 
 @dataclass(frozen=True, eq=False)
 class FlangeScan:
-    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no
-    flange)."""
+    """Hold a scan (H, W, 3) m and the pose X_CR of the flange in it.
+
+    NaN where nothing was measured; None without a flange.
+    """
 
     points_C: Array
     X_CR: RigidTransform | None
@@ -67,8 +70,10 @@ def flange_frame(
     clutter: int = 6,
     before: tuple[TriMesh, ...] = (),
 ) -> FlangeScan:
-    """A frame with the flange on an arm's wrist, a table behind, and ``clutter`` things about it that do not hide it;
-    ``before`` holds bodies (in the camera frame) that may."""
+    """A frame with the flange on an arm's wrist, a table behind, and ``clutter`` things about it that do not hide it.
+
+    ``before`` holds bodies (in the camera frame) that may.
+    """
     X_CR = random_place(scanner, standard, rng) if X_CR is None else X_CR
     bodies = [m.transformed(X_CR) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, clutter, clear_of=X_CR)
@@ -83,8 +88,10 @@ def sphere_frame(
     p_FS: Array,
     radius_m: float,
 ) -> Array:
-    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a
-    table."""
+    """Make a scan (H, W, 3) m of a flange at X_CF on its wrist, over a table.
+
+    It carries a ball of this radius at p_FS (3,) m.
+    """
     ball = _ball(radius_m, 121).transformed(X_CF @ RigidTransform(p_FS))
     bodies = [m.transformed(X_CF) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, 0, clear_of=X_CF)
@@ -92,8 +99,10 @@ def sphere_frame(
 
 
 def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> FlangeScan:
-    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube
-    ends)."""
+    """A frame without the flange.
+
+    A table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends).
+    """
     bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
@@ -101,8 +110,11 @@ def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random
 
 
 class FrameFit(NamedTuple):
-    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was
-    seen."""
+    """Hold the figures of a fit.
+
+    The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was
+    seen.
+    """
 
     error_m: float
     normalised: float
@@ -230,12 +242,7 @@ def _ball(radius: float, rings: int = 25) -> TriMesh:
 
 def _scan(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
     """The frame that the scanner returns of these bodies."""
-    all_of_it = merge(*bodies)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(all_of_it.vertices.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(all_of_it.triangles.astype(np.uint32)),
-    )
+    scene = make_scene(merge(*bodies))
     rays = np.zeros((scanner.height, scanner.width, 6), dtype=np.float32)
     rays[..., 3] = ((np.arange(scanner.width) - scanner.cx) / scanner.fx)[None, :]
     rays[..., 4] = ((np.arange(scanner.height) - scanner.cy) / scanner.fy)[:, None]
@@ -264,9 +271,10 @@ class SphereScan:
 
 
 def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[SphereScan]:
-    """``n`` scans of a flange that carries a sphere, by one arm and one scanner whose errors no estimate is given:
-    links 0.4 mm (rms at the flange), repeatability 0.035 mm, scale 0.2 %, gradient 0.13 % per 100 mm, a warp of 0.1
-    mm."""
+    """``n`` scans of a flange that carries a sphere, by one arm and one scanner whose errors no estimate is given.
+
+    Links 0.4 mm (rms at the flange), repeatability 0.035 mm, scale 0.2 %, gradient 0.13 % per 100 mm, a warp of 0.1 mm.
+    """
     rng = np.random.default_rng(seed)
     arm, standard = load_arm("ur10e"), get_flange("iso9409-1-50-4-m6")
     true = draw_true_arm(arm, _ARM_MM, _HOME, rng)
@@ -303,8 +311,10 @@ def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[Sphe
 
 
 def _sphere(points_C: Array, fit: FlangeFit) -> Array:
-    """Centre of the ball beside the fitted flange: what stands proud of the face, on the ring where the ball must
-    lie."""
+    """Centre of the ball beside the fitted flange.
+
+    What stands proud of the face, on the ring where the ball must lie.
+    """
     p = points_C.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
     away = p - fit.center_C

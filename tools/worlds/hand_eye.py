@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseNumbers
 from weldcal.calibration.geometry.se3 import (
+    as_transform,
     exp_rotation,
     flange_poses,
     inverse,
@@ -21,7 +22,7 @@ from weldcal.calibration.geometry.se3 import (
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform, solve_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -38,9 +39,11 @@ _LEAST = 6  # corners in an image that is kept
 
 @dataclass(frozen=True)
 class PairedPoses:
-    """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as
-    estimated, ``X`` (4, 4) and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this
-    ``kind``."""
+    """Pairs of one cell.
+
+    ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4) and
+    ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``.
+    """
 
     kind: str
     F: Array
@@ -185,9 +188,11 @@ class MistakenPairs:
 
 @dataclass(frozen=True)
 class SolverVerdict:
-    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the
-    mistake), or "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the
-    truth."""
+    """What the solver said of a world.
+
+    "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or "NAN" and "WRONG", which must
+    not be; ``nees``: of the answer, in units of the region that holds the truth.
+    """
 
     said: str
     sentence: str
@@ -195,8 +200,11 @@ class SolverVerdict:
 
 
 def random_world(rng: np.random.Generator, mistake: str | None = None) -> MistakenPairs:
-    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a
-    corner), outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
+    """Draw a world with any motion, mounting, noise and outliers, and one of the usual mistakes.
+
+    The noise is normal or heavy-tailed, about the middle of a board whose origin is a corner. ``mistake``: the mistake;
+    else half of them are without.
+    """
     motion = str(rng.choice(MOTIONS))
     if mistake is None:
         mistake = "none" if rng.uniform() < 0.5 else str(rng.choice(MISTAKES[1:]))
@@ -334,8 +342,10 @@ class WrittenSet:
 
 
 def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
-    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each; one list may be changed as
-    a whole."""
+    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each.
+
+    One list may be changed as a whole.
+    """
     n = int(rng.integers(6, 41)) if n is None else n
     noise = np.radians(ROTATION_DEG) * rng.uniform(), 1e-3 * POSITION_MM * rng.uniform()
     turned = Rotation.from_rotvec(rng.normal(size=(n, 3)) * float(rng.choice(_SPREADS)) / 2.0) * Rotation.random(

@@ -41,8 +41,11 @@ _FACE_M = 0.025  # a fitted normal is that of a plane through a ring of this rad
 
 @dataclass(frozen=True, eq=False)
 class LightRuns:
-    """Calibrations (k): scans that each took, error and expected error (m) at the work point, and whether the error
-    lies in the stated 95 % region. ``rigid_m`` are the errors of the same scans without a scanner correction."""
+    """Calibrations (k).
+
+    Scans that each took, error and expected error (m) at the work point, and whether the error lies in the stated 95 %
+    region. ``rigid_m`` are the errors of the same scans without a scanner correction.
+    """
 
     scans: Array
     error_m: Array
@@ -75,8 +78,9 @@ class _World:
 
 
 def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: Progress = no_progress) -> LightRuns:
-    """Calibrate ``runs`` times in the scenario's simulated world, with a device, an arm and a mounting of its own each
-    time.
+    """Calibrate ``runs`` times in the scenario's simulated world.
+
+    Each time with a device, an arm and a mounting of its own.
 
     The job's own poses and stopping rule; the rendering and the flange fit are replaced by their stated noise. The
     arm's links and the scanner's warp are drawn from models that the estimator does not contain. Deterministic for
@@ -239,8 +243,11 @@ def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorl
 
 @dataclass(frozen=True, eq=False)
 class RedrawnStation:
-    """What made the observations: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms),
-    the true X_BC, and the work point (3,) m in B."""
+    """What made the observations.
+
+    Arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms), the true X_BC, and the work point
+    (3,) m in B.
+    """
 
     arm: ArmModel
     joints: Array
@@ -251,8 +258,10 @@ class RedrawnStation:
 
 @dataclass(frozen=True, eq=False)
 class Redrawn:
-    """Errors (k,) of a point at the work point (m) and of the rotation (rad): of calibrations whose noise was drawn
-    anew, and of as many draws from the Gaussian that the Cramer-Rao bound allows."""
+    """Errors (k,) of a point at the work point (m) and of the rotation (rad).
+
+    Of calibrations whose noise was drawn anew, and of as many draws from the Gaussian that the Cramer-Rao bound allows.
+    """
 
     at_work_m: Array
     rotation_rad: Array
@@ -267,8 +276,10 @@ class Redrawn:
 
 
 def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Array) -> Array:
-    """Joints (n, 6) rad in which a bare flange stands where each observation says: the solution nearest to
-    ``q_home``."""
+    """Joints (n, 6) rad in which a bare flange stands where each observation says.
+
+    The solution nearest to ``q_home``.
+    """
     out = []
     for o in observations:
         solutions = inverse_kinematics(arm, o.X_BR)
@@ -277,8 +288,11 @@ def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Arra
 
 
 def redraw(observations: tuple[Observation, ...], station: RedrawnStation, count: int, seed: int = 0) -> Redrawn:
-    """``count`` calibrations from the poses of these observations, each with noise of its own: joint offsets that
-    displace the flange by the repeatability, and fits that err as they state. Deterministic for ``seed``."""
+    """``count`` calibrations from the poses of these observations, each with noise of its own.
+
+    Joint offsets that displace the flange by the repeatability, and fits that err as they state. Deterministic for
+    ``seed``.
+    """
     rng = np.random.default_rng(seed)
     errors = np.empty((2, count))
     for k in range(count):
@@ -298,8 +312,9 @@ def joined(parts: list[Redrawn]) -> Redrawn:
 
 
 def bound_covariance(observations: tuple[Observation, ...], station: RedrawnStation) -> Array:
-    """Cramer-Rao: the least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased
-    calibration from these observations of a bare flange can have.
+    """Compute the Cramer-Rao bound of a calibration from these observations of a bare flange.
+
+    The least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased calibration can have.
 
     The arm's error is six independent joint offsets that displace the flange by the repeatability (rms); the scanner's
     is what each fit states of itself. Centre and normal of a pose err together, as one offset of the joints moves both.

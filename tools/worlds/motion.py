@@ -22,7 +22,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_ar
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.mesh import extrude
 from weldcal.models.robots import get_robot
 from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
@@ -45,8 +45,9 @@ _NO_MOTION: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees; zeros:
-    nothing happens.
+    """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees.
+
+    Zeros: nothing happens.
 
     knock_s, knock_mm, knock_deg   the scanner's housing jumps: its own origin by knock_mm, its axes by knock_deg
     creep_mm_per_min               the scanner moves steadily from creep_s on base_s, base_mm, base_deg      the robot's
@@ -68,11 +69,13 @@ class Disturbance:
     warm_up_gradient_per_m: float = 0.0
 
     def world_in_base(self, t: float) -> RigidTransform:
-        """Pose X_BW of what stands still, in the robot's base, at ``t`` s; the two are one before the base has
-        moved."""
+        """Pose X_BW of what stands still, in the robot's base, at ``t`` s.
+
+        The two are one before the base has moved.
+        """
         if t < self.base_s or not any((*self.base_mm, *self.base_deg)):
             return RigidTransform()
-        return _pose(self.base_mm, self.base_deg).inverse()
+        return RigidTransform(RollPitchYaw(np.radians(self.base_deg)), 1e-3 * np.array(self.base_mm)).inverse()
 
     def scanner_pose(self, X_BC: RigidTransform, t: float) -> RigidTransform:
         """The scanner's true pose in the robot's base at ``t`` s, ``X_BC`` where nothing has happened."""
@@ -113,10 +116,6 @@ class Disturbance:
                 "gradient_per_m": self.warm_up_gradient_per_m,
             }
         return out
-
-
-def _pose(mm: Vector, deg: Vector) -> RigidTransform:
-    return RigidTransform(RollPitchYaw(np.radians(deg)), 1e-3 * np.array(mm))
 
 
 def disturbance_of(knock: str = "", creep: str = "", base: str = "", warm_up: str = "") -> Disturbance:
@@ -210,8 +209,10 @@ class MotionOptions:
 
 @dataclass(frozen=True, eq=False)
 class StreamedFrame:
-    """A streamed frame: depth (H, W) m, and the truth behind it: the capture on the robot's clock and both poses
-    then."""
+    """A streamed frame: depth (H, W) m, and the truth behind it.
+
+    The capture on the robot's clock and both poses then.
+    """
 
     id: str
     depth: Depth
@@ -398,11 +399,8 @@ def surroundings(centre: Array) -> list[RigidBody]:
         place = centre + np.array([x, y, 0.0])
         size = np.array([[-0.03, -0.04], [0.03, -0.04], [0.03, 0.04], [-0.03, 0.04]]) + place[:2]
         blocks.append(RigidBody(None, extrude(size, 0.0, top)))
-    return [*blocks, RigidBody(None, _table())]
-
-
-def _table() -> TriMesh:
-    return extrude(np.array([[-0.3, -0.8], [1.6, -0.8], [1.6, 0.8], [-0.3, 0.8]]), -0.03, 0.0)
+    table = extrude(np.array([[-0.3, -0.8], [1.6, -0.8], [1.6, 0.8], [-0.3, 0.8]]), -0.03, 0.0)
+    return [*blocks, RigidBody(None, table)]
 
 
 def _mounted(X: RigidTransform, translation_m: float, rotation_rad: float, rng: np.random.Generator) -> RigidTransform:
@@ -463,8 +461,10 @@ class StaticMode:
 
 
 def noise_of_face(points_C: Array, fit: FlangeFit, world: MotionWorld) -> tuple[float, float, int]:
-    """Rms of the points of the flat face about its plane (mm), rms of its outer edge about its circle (mm), and their
-    number."""
+    """Compute the rms (mm) of the face's points about its plane and of its outer edge about its circle.
+
+    With the number of points of the flat face.
+    """
     flat = points_C.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])]
     d = flat - fit.center_C

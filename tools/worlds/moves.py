@@ -1,7 +1,7 @@
 """Light worlds for calibration in motion: moves through a cube, what a streaming scanner measures of them, drift."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -11,7 +11,7 @@ from weldcal.calibration.geometry.se3 import difference, exp_rotation, fit_rigid
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
 from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves
 from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.models.arms.chain import chain_inverse, load_chain
+from weldcal.models.arms.chain import chain_inverse, chain_of, chain_poses, load_chain
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
@@ -32,8 +32,10 @@ _SHAPE = 4.0  # of the gamma law of the transport's tail: skewness 1
 def cube_moves(
     rng: np.random.Generator, *, linear: bool = False, tilt_deg: float = 15.0
 ) -> tuple[Moves, RigidTransform]:
-    """Moves of a UR10e through four corners of a 200 mm cube, flange up, and a scanner's pose X_BC above that looks
-    down."""
+    """Make moves of a UR10e through four corners of a 200 mm cube, flange up, and a scanner's pose X_BC.
+
+    The scanner is above and looks down.
+    """
     chain = load_chain(ROBOT)
     middle = np.array([rng.uniform(0.45, 0.65), rng.uniform(-0.25, 0.25), rng.uniform(0.25, 0.4)])
     turn = rng.uniform(-np.pi, np.pi)
@@ -119,8 +121,10 @@ def _axes(n: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class TargetInHand:
-    """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on
-    the flange."""
+    """A fixed target X_BT as it moves in the frame of a moving flange.
+
+    What takes the place of Moves for a scanner on the flange.
+    """
 
     moves: Moves
     X_BT: RigidTransform
@@ -139,7 +143,7 @@ def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: Rig
     X = moves.at(capture)
     rate = (moves.at(capture + _STEP_S) - moves.at(capture - _STEP_S)) / (2.0 * _STEP_S)
     p, n = X[:, :3, 3], X[:, :3, 2]
-    A = _tangents(n)
+    A = _axes(n)[:, :, :2]
     At = np.swapaxes(A, 1, 2)
     g = np.concatenate([rate[:, :3, 3], np.einsum("nij,nj->ni", At, rate[:, :3, 2])], axis=1)
     found = X_BC
@@ -163,14 +167,6 @@ def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: Rig
     return np.asarray(error / np.sqrt(np.diag(np.linalg.inv(N))[:7]))
 
 
-def _tangents(n: Array) -> Array:
-    """Two unit vectors (N, 3, 2) at right angles to normals n (N, 3)."""
-    other = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(n, other)
-    x /= np.linalg.norm(x, axis=1)[:, None]
-    return np.stack([x, np.cross(n, x)], axis=2)
-
-
 _CENTER = np.array([-0.65, -0.25, 0.45])  # of the work, in B
 _Q_NEAR = np.array([0.3, -1.6, 2.0, -2.0, -1.5, 0.3])
 _STEP_S = 0.004
@@ -179,9 +175,10 @@ _ACCELERATION = 1.2  # m/s^2 of the TCP, roughly
 
 @dataclass(frozen=True)
 class Change:
-    """Something that happens at ``time_s``: the scanner turns by ``rotation_rad`` (3,) about its own origin and shifts
-    by ``translation_m`` (3,), in the base, at once or, over ``over_s`` seconds, evenly; ``scale`` changes with exp(-t /
-    over_s).
+    """Something that happens at ``time_s``.
+
+    The scanner turns by ``rotation_rad`` (3,) about its own origin and shifts by ``translation_m`` (3,), in the base,
+    at once or, over ``over_s`` seconds, evenly; ``scale`` changes with exp(-t / over_s).
     """
 
     time_s: float = np.inf
@@ -193,7 +190,8 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """What differs between worlds: size of the work (m), speed (m/s), time between frames (s), jitter of the stamps:
+    """What differs between worlds: size of the work (m), speed (m/s), time between frames (s), jitter of the stamps.
+
     ``device`` a clock of 0.1 ms, ``arrival`` a skewed transport of 15 ms; sigmas of systematic errors of the arm (rad)
     and the scanner (m).
     """
@@ -234,12 +232,10 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> FeatureWorld:
     rng = np.random.default_rng(seed)
     z = -_CENTER / np.linalg.norm(_CENTER) * 0.2 + np.array([0.1, 0.35, -0.9])
     z = z / np.linalg.norm(z)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    R_true = np.column_stack([x, np.cross(z, x), z])
+    R_true = _facing(z)
     p_true = _CENTER - 0.65 * z
-    nominal = np.asarray(load_arm("ur10e").stack)
-    actual = _perturbed(nominal, config.arm_rad, rng)
+    nominal = load_chain(ROBOT)
+    actual = replace(nominal, stack=_perturbed(nominal.stack, config.arm_rad, rng))
     warp = _warp(config.warp_m, rng)
     n = int(duration_s / config.frame_s)
     capture: Array = np.asarray((np.arange(n) + rng.uniform()) * config.frame_s * (1.0 + 2e-5 * rng.standard_normal()))
@@ -251,11 +247,11 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> FeatureWorld:
         q = _loop(config, -z, rng)
         period = len(q) * _STEP_S
         phase, late = np.mod(capture[now], period), np.mod(stamps[now], period)
-        for stack, at, out_p, out_n in ((nominal, late, p, nrm), (actual, phase, p_act, n_act)):
-            X = _chain(stack, q)
+        for arm, at, out_p, out_n in ((nominal, late, p, nrm), (actual, phase, p_act, n_act)):
+            X = chain_poses(arm, q)
             out_p[now], out_n[now] = _sample(X[:, :3, 3], at), _unit(_sample(X[:, :3, 2], at))
-        V[now] = _sample(_velocities(_chain(nominal, q)), late)
-        believed[now] = _sample(_chain(nominal, q)[:, :3, 3], phase)
+        V[now] = _sample(_velocities(chain_poses(nominal, q)), late)
+        believed[now] = _sample(chain_poses(nominal, q)[:, :3, 3], phase)
     R_k, p_k, scale = _scanner(config.changes, R_true, p_true, capture)
     p_C = np.einsum("nji,nj->ni", R_k, p_act - p_k)
     n_C = np.einsum("nji,nj->ni", R_k, n_act)
@@ -365,7 +361,7 @@ def _loop(config: WorldConfig, towards: Array, rng: np.random.Generator) -> Arra
             continue
         goals.append(q)
         near = goals[0]
-    places = [_chain(np.asarray(arm.stack), q[None])[0, :3, 3] for q in goals]
+    places = chain_poses(chain_of(arm), np.array(goals))[:, :3, 3]
     out = []
     for k in range(len(goals)):
         j = (k + 1) % len(goals)
@@ -386,17 +382,6 @@ def _facing(z: Array) -> Array:
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
-
-
-def _chain(stack: Array, q: Array) -> Array:
-    """Flange poses (n, 4, 4) at joint positions (n, 6)."""
-    X = np.tile(np.eye(4), (len(q), 1, 1))
-    for k in range(6):
-        turn = np.tile(np.eye(4), (len(q), 1, 1))
-        c, s = np.cos(q[:, k]), np.sin(q[:, k])
-        turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
-        X = X @ stack[k] @ turn
-    return X
 
 
 def _velocities(X: Array) -> Array:

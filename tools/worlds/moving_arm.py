@@ -22,20 +22,19 @@ import open3d as o3d
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, kinematics_and_jacobian, link_frames
-from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.arms.inverse import continued_solution, inverse_kinematics, nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, link_frames
+from weldcal.models.arms.urdf import arm_urdf, placed_solid
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth, noisy_depth
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
-from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.scanner_streams import ScannerStream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset
 
 MOVES = ("moveJ", "moveL")
 _SAMPLES = 33  # of a segment, for its length and its largest speed
-_NEWTON_M = 1e-10
 
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5
 """Four corners of a cube that lie in no plane (section 3.2 of the paper), in units of its edge."""
@@ -100,20 +99,12 @@ class Segment:
     def joints(self, s: float) -> Array:
         """Joint angles (6,) rad at ``s``."""
         q = self._q[0] + s * (self._q[1] - self._q[0])
-        return q if not self._linear else _newton(self._arm, self._pose(s), q)
-
-
-def _newton(arm: ArmModel, X: RigidTransform, q: Array) -> Array:
-    """Joint angles (6,) rad of a pose from others not far away."""
-    R_goal, p_goal = X.rotation().matrix(), X.translation()
-    for _ in range(12):
-        R, p, J = kinematics_and_jacobian(arm, q)
-        turn = R_goal @ R.T
-        e = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1], *(2.0 * (p_goal - p))])
-        if float(np.abs(e).max()) < _NEWTON_M:
-            return q
-        q = q + np.linalg.solve(J, 0.5 * e)
-    raise InputError("A straight move passes a singularity of the arm: use moveJ, or another place of the cube.")
+        found = continued_solution(self._arm, self._pose(s), q) if self._linear else q
+        if found is None:
+            raise InputError(
+                "A straight move passes a singularity of the arm: use moveJ, or another place of the cube."
+            )
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +169,10 @@ def path_through(
 def cube_poses(
     centre_m: Array, edge_m: float, towards: RotationMatrix, lean_rad: float, rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """Flange poses at four corners of a cube about ``centre_m``, each turned away from ``towards`` by up to
-    ``lean_rad``."""
+    """Compute flange poses at four corners of a cube about ``centre_m``.
+
+    Each is turned away from ``towards`` by up to ``lean_rad``.
+    """
     return [leaning(centre_m + edge_m * corner, towards, lean_rad, rng) for corner in CORNERS]
 
 
@@ -189,8 +182,8 @@ def leaning(p: Array, towards: RotationMatrix, lean_rad: float, rng: np.random.G
     return RigidTransform(towards @ off, p)
 
 
-def reachable_start(arm: ArmModel, X_BF: RigidTransform, elbow_up: bool = True) -> Array:
-    """Joint angles (6,) rad for a pose, with the elbow as high as it gets (or as low).
+def reachable_start(arm: ArmModel, X_BF: RigidTransform) -> Array:
+    """Joint angles (6,) rad for a pose, with the elbow as high as it gets.
 
     Raises InputError out of reach.
     """
@@ -198,14 +191,11 @@ def reachable_start(arm: ArmModel, X_BF: RigidTransform, elbow_up: bool = True) 
     if not len(found):
         raise InputError(f"The {arm.name} does not reach the cube: move it nearer.")
     # the height of the elbow, by the upper arm's angle
-    height = [-np.sin(q[1]) for q in found]
-    order = np.argsort(height)
-    return np.asarray(found[int(order[-1 if elbow_up else 0])], dtype=np.float64)
+    return np.asarray(found[int(np.argsort([-np.sin(q[1]) for q in found])[-1])], dtype=np.float64)
 
 
 Pixels = npt.NDArray[np.intp]
 
-_SEGMENTS = 192  # of a turned body
 _THICK_M = 0.012
 _NODES = (
     5  # exact arm poses over the readout; rows between them are interpolated, which bends by less than 0.1 micrometre
@@ -219,8 +209,10 @@ _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base; ``dark`` 0 to
-    1."""
+    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base.
+
+    ``dark`` 0 to 1.
+    """
 
     link: int | None
     mesh: TriMesh
@@ -254,27 +246,10 @@ def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
     bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
         for visual in link.iter("visual"):
-            origin, geometry, material = (visual.find(tag) for tag in ("origin", "geometry", "material"))
-            assert origin is not None
-            assert geometry is not None
+            material, number = visual.find("material"), arm.link_names.index(link.get("name", ""))
             assert material is not None
-            xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
-            mesh = _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
-            bodies.append(
-                RigidBody(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
-            )
+            bodies.append(RigidBody(number, placed_solid(visual), _DARK.get(material.get("name", ""), 0.0)))
     return bodies
-
-
-def _solid(shape: ET.Element) -> TriMesh:
-    if shape.tag == "cylinder":
-        r, half = float(shape.get("radius", "0")), 0.5 * float(shape.get("length", "0"))
-        return revolve(np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)]), _SEGMENTS)
-    a, _, c = (float(shape.get(key, "0")) for key in "abc")
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
-    profile = np.column_stack([a * np.cos(angle), c * np.sin(angle)])
-    profile[[0, -1], 0] = 0.0
-    return revolve(profile, _SEGMENTS)
 
 
 class MovingScene:
@@ -330,8 +305,10 @@ class MovingScene:
     def _mixed(
         self, joints: Callable[[float], Array], X_BC: RigidTransform, capture_s: float, n: int, rng: np.random.Generator
     ) -> tuple[Depth, Depth]:
-        """Depth and darkness (H, W) after the exposure: the mean of its samples on a surface, one or a mix of two at an
-        edge."""
+        """Depth and darkness (H, W) after the exposure.
+
+        The mean of its samples on a surface, one or a mix of two at an edge.
+        """
         stream, shape = self.stream, self._rays.shape[:2]
         offsets = stream.exposure_s * ((np.arange(n) + 0.5) / n - 0.5)
         dark = np.zeros(shape, dtype=np.float32)
@@ -345,8 +322,10 @@ class MovingScene:
         return out, dark
 
     def _pixels(self, body: _Cast, X_CL: list[RigidTransform]) -> Pixels:
-        """Indices (n,) of the pixels in which a body may show during a frame: where a coarse picture shows it, and
-        around."""
+        """Indices (n,) of the pixels in which a body may show during a frame.
+
+        Where a coarse picture shows it, and around.
+        """
         assert body.link is not None
         X = X_CL[body.link]
         R, p = X.rotation().matrix(), X.translation()

@@ -32,8 +32,10 @@ DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # a scann
 
 @dataclass(frozen=True, kw_only=True)
 class WorldErrors:
-    """One sigma of each cause (m, rad): lengths, joints and twists of the arm, sag per metre of lever, sensor, tip,
-    repeatability."""
+    """One sigma of each cause (m, rad).
+
+    Lengths, joints and twists of the arm, sag per metre of lever, sensor, tip, repeatability.
+    """
 
     length_m: float = 0.125e-3
     angle_rad: float = np.radians(0.0125)
@@ -50,8 +52,11 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerCell:
-    """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and
-    where the groove's and the frustum's frames lie, the groove turned about z."""
+    """Where a world's arm stands.
+
+    Its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where the groove's and the
+    frustum's frames lie, the groove turned about z.
+    """
 
     arm: DhArm
     home: Floats
@@ -105,7 +110,7 @@ class SphereTests:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereWorld:
-    """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
+    """One robot with one profiler and one torch: `cell.arm` is what is believed, the rest is how it is."""
 
     cell: ProfilerCell
     real: DhArm
@@ -121,8 +126,10 @@ class SphereWorld:
 
     @staticmethod
     def like_the_files(seed: int) -> SphereWorld:
-        """Of another seed than the fixed files, and else as they were made: only the arm's table, the tip and signs
-        vary."""
+        """Of another seed than the fixed files, and else as they were made.
+
+        Only the arm's table, the tip and signs vary.
+        """
         e = WorldErrors(angle_rad=np.radians(0.015), twist_rad=np.radians(0.01))
         rng = np.random.default_rng([seed, 75])
         cell = files_cell()
@@ -167,23 +174,13 @@ class SphereWorld:
             errors=e,
         )
 
-    @property
-    def nominal(self) -> DhArm:
-        """The arm as it is drawn."""
-        return self.cell.arm
-
-    @property
-    def center(self) -> Floats:
-        """The sphere's (3,) m in B."""
-        return self.cell.center
-
     def poses(self, q: Floats) -> FlangePoses:
         """Where the flange really is."""
         return self.real.poses(q, np.zeros(len(OFFSET_JOINTS)), self.sag, self.real.loads(q))
 
     def believed(self, q: Floats) -> FlangePoses:
         """Where the controller says that it is."""
-        return self.nominal.poses(q, np.zeros(len(OFFSET_JOINTS)), np.zeros(2), self.nominal.loads(q))
+        return self.cell.arm.poses(q, np.zeros(len(OFFSET_JOINTS)), np.zeros(2), self.cell.arm.loads(q))
 
     def repeated(self, q: Floats, rng: np.random.Generator) -> FlangePoses:
         """Where the flange is this time."""
@@ -200,7 +197,7 @@ class SphereWorld:
         """Joints (n, 6) that the controller finds for flange poses, by Newton's method from the cell's home."""
         q = np.tile(self.cell.home, (len(p_BF), 1))
         for _ in range(60):
-            X = self.nominal.frames(q)
+            X = self.cell.arm.frames(q)
             dp = p_BF - X[:, 6, :3, 3]
             turn = Rotation.from_matrix(R_BF @ np.swapaxes(X[:, 6, :3, :3], 1, 2)).as_rotvec()
             axes = np.swapaxes(X[:, :6, :3, 2], 1, 2)
@@ -247,7 +244,7 @@ def looking_down(rng: np.random.Generator, n: int, tilt_deg: float, yaw_deg: flo
 
 def arcs(world: SphereWorld, q: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Profiles (n, 120, 2) m of the sphere at these joints, and on which side (n,) of the scan plane its centre is."""
-    c = world.in_scanner(world.repeated(q, rng), np.tile(world.center, (len(q), 1)))
+    c = world.in_scanner(world.repeated(q, rng), np.tile(world.cell.center, (len(q), 1)))
     r = np.sqrt(RADIUS_M**2 - c[:, 1] ** 2)
     a = np.linspace(-REACH_RAD, REACH_RAD, SAMPLES)
     p = np.stack([c[:, :1] + r[:, None] * np.sin(a), c[:, 2:] - r[:, None] * np.cos(a)], axis=2)
@@ -267,8 +264,10 @@ class SphereTrial:
 def sphere_trial(
     world: SphereWorld, seed: int, *, translations: int = 10, free: int = 10, touches: int = 60, views: int = 10
 ) -> SphereTrial:
-    """Ten translations, ten free poses (tilt 12, turn 10 deg), sixty touches and three points seen and touched in ten
-    views."""
+    """Make ten translations, ten free poses, sixty touches and three points measured and touched in ten views.
+
+    The free poses tilt by 12 deg and turn by 10 deg.
+    """
     rng = np.random.default_rng([seed, 72])
     n = translations + free
     R_BS = np.concatenate(
@@ -283,11 +282,11 @@ def sphere_trial(
             np.concatenate([rng.uniform(0.198, 0.226, translations), rng.uniform(0.195, 0.230, free)]),
         ]
     )
-    q = world.joints(*world.viewing(R_BS, p_S, np.tile(world.center, (n, 1))))
+    q = world.joints(*world.viewing(R_BS, p_S, np.tile(world.cell.center, (n, 1))))
     profiles, sign = arcs(world, q, rng)
     out = rng.standard_normal((touches, 3))
     out[:, 2] = np.abs(out[:, 2])
-    felt = world.center + RADIUS_M * out / np.linalg.norm(out, axis=1, keepdims=True)
+    felt = world.cell.center + RADIUS_M * out / np.linalg.norm(out, axis=1, keepdims=True)
     felt += world.errors.repeatability_m * rng.standard_normal(felt.shape)
     touch_q = world.touching(felt, looking_down(rng, touches, 15.0, 15.0))
     data = SphereData(
@@ -296,13 +295,13 @@ def sphere_trial(
         radius_m=RADIUS_M,
         touches=world.believed(touch_q),
         tip=world.tip_believed,
-        arm=world.nominal,
+        arm=world.cell.arm,
         q=q,
         touch_q=touch_q,
     )
     tests = None
     if views:
-        points = world.center + np.repeat(
+        points = world.cell.center + np.repeat(
             [[0.04, -0.06, 0.01], [-0.05, 0.02, -0.015], [0.01, 0.07, 0.025]], views, axis=0
         )
         m = len(points)

@@ -98,9 +98,10 @@ def published_touches() -> TabletTouches:
 
 @dataclass(frozen=True, kw_only=True)
 class TabletNoise:
-    """Noise of the simulated devices, as the paper's data suggest it: a depth camera that reads 1.5 % short and 0.8 mm
-    noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px off the dot, a table
-    level within 0.7 deg.
+    """Noise of the simulated devices, as the paper's data suggest it.
+
+    A depth camera that reads 1.5 % short and 0.8 mm noisy, blobs of 0.15 px read to whole pixels, hands read to whole
+    millimetres, touches 2.5 px off the dot, a table level within 0.7 deg.
     """
 
     depth_scale: float = 0.985
@@ -130,8 +131,10 @@ class TabletTrial:
 
 
 def simulate_trial(seed: tuple[int, ...], noise: TabletNoise | None = None, queries: int = 16) -> TabletTrial:
-    """One trial with a mounting, a pen and a tablet drawn from the seed; the camera hangs about 172 mm over the
-    tablet."""
+    """One trial with a mounting, a pen and a tablet drawn from the seed.
+
+    The camera hangs about 172 mm over the tablet.
+    """
     noise = noise or TabletNoise()
     rng = np.random.default_rng(seed)
     pitch = published_touches().pitch_m

@@ -1,5 +1,7 @@
-"""A light world of a cell: its true arm, scanner and tip, the calibration from its scans, and touches of plates,
-spheres, an edge and a point."""
+"""A light world of a cell.
+
+Its true arm, scanner and tip, the calibration from its scans, and touches of plates, spheres, an edge and a point.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -8,15 +10,15 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.stated_error import orientations_of
+from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
-from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.calibration.touch.touches import EDGE, PLANE, POINT, SPHERE, Touch
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.tools.worlds.wrong_models import distorted
 
 SCANS = 12
 FEATURES = (PLANE, PLANE, SPHERE, SPHERE, EDGE, POINT)
@@ -57,7 +59,7 @@ def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
     X_BC = down @ RigidTransform(
         RotationMatrix.ProjectToRotationMatrix(exp_rotation(0.15 * rng.normal(size=3))), np.zeros(3)
     )
-    scanner = _Scanner(X_BC.inverse(), 1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal())
+    scanner = _Scanner(X_BC.inverse(), (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal()))
     observations = [_scan(f"p{i}", nominal, true, scanner, rng) for i in range(scans)]
     tip = _TIP + _TAUGHT_M * rng.normal(size=3)
     ball = _TIP_RADIUS + _BALL_M * rng.uniform(-1.0, 1.0)
@@ -70,15 +72,11 @@ def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
 @dataclass(frozen=True, eq=False)
 class _Scanner:
     X_CB: RigidTransform
-    scale: float
-    gradient: Array
-    radial: float
+    bend: tuple[float, Array, float]
 
     def sees(self, p_B: Array) -> Array:
         """Where the scanner puts a point (3,) m of the base."""
-        p = np.asarray(self.X_CB.multiply(p_B))
-        x = p[:2] / p[2]
-        return np.asarray(p * (1.0 + self.scale + self.gradient @ p[:2] + self.radial * float(x @ x)))
+        return distorted(np.asarray(self.X_CB.multiply(p_B)), self.bend)
 
 
 def _wrong(arm: ArmModel, rng: np.random.Generator) -> ArmModel:

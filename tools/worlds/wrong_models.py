@@ -56,8 +56,10 @@ def _splines(device: int, warp_m: float) -> Array:
 
 
 def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
-    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x
-    and y."""
+    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m.
+
+    No polynomial in x and y.
+    """
     column, row = ((1.0 + p_C[k] / p_C[2] / _FIELD) * 200.0 for k in (0, 1))
     place = [[row + _BORDER], [column + _BORDER]]
     off = float(map_coordinates(_splines(device, warp_m), place, order=3, mode="nearest", prefilter=False)[0])
@@ -96,14 +98,14 @@ def warped_observations(
 
 def _circle(X_CR: RigidTransform, center_C: Array, ratio: float) -> HolePattern:
     """The hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
-    return HolePattern(
-        holes_C=np.zeros((4, 3)), angles_rad=np.zeros(4), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0
-    )
+    return HolePattern(holes_C=np.zeros((4, 3)), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0)
 
 
 def arm_error(p_B: Array, device: int, arm_m: float) -> Array:
-    """By how much (3,) m an arm misses a place: six waves of about 0.8 m, as kinematics that are off by hundredths of a
-    degree do."""
+    """By how much (3,) m an arm misses a place.
+
+    Six waves of about 0.8 m, as kinematics that are off by hundredths of a degree do.
+    """
     rng = np.random.default_rng([device, 41])
     waves, phases = 2.0 * np.pi / _ARM_WAVE_M * rng.standard_normal((6, 3)), rng.uniform(0.0, 2.0 * np.pi, 6)
     along = arm_m * np.sqrt(2.0 / 6.0) * rng.standard_normal((6, 3))
@@ -130,9 +132,11 @@ SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal p
 
 
 def simulated_observations(n: int, rng: np.random.Generator) -> tuple[list[Observation], RigidTransform]:
-    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and
-    ``SIGMA_RAD`` an axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane,
-    which a calibration refuses, are drawn again."""
+    """Observations (n) of a flange and the camera's true pose X_BC.
+
+    Arm and scanner are off by ``SIGMA_M`` and ``SIGMA_RAD`` an axis, the fit by what its own covariance says (0.02 to
+    0.06 mm). Places that lie in one plane, which a calibration refuses, are drawn again.
+    """
     X_BC = RigidTransform(
         RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
     )
@@ -199,8 +203,11 @@ _CANDIDATES = 250
 
 @dataclass(frozen=True)
 class WrongArmStation:
-    """One world: stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that
-    no estimate is given."""
+    """Hold one world of an arm with errors.
+
+    Stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that no estimate is
+    given.
+    """
 
     observations: list[Observation]
     q: Array
@@ -213,9 +220,10 @@ class WrongArmStation:
 def station(
     seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = True, links: bool = True, size: float = 1.0
 ) -> WrongArmStation:
-    """A UR10e with offsets of 0.02 to 0.05 degrees and axes off by 0.1 to 0.3 mm and 0.02 degrees, and a scanner 0.65 m
-    from its flange with a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the
-    correction's polynomial has only in part.
+    """Draw a UR10e with wrong joints and axes, and a distorting scanner 0.65 m from its flange.
+
+    Joint offsets of 0.02 to 0.05 degrees, axes off by 0.1 to 0.3 mm and 0.02 degrees; the scanner has a scale error of
+    0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the correction's polynomial has only in part.
 
     ``planned``: the scans are those of 250 candidates that tell most (informative_poses); the new ones are random.
     Without ``links`` only the joints' zeros are wrong; ``size`` multiplies the errors.
@@ -269,25 +277,28 @@ def _seen(
     rng: np.random.Generator,
     name: str,
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """What the wrong scanner sees of the wrong arm, and of its hole circles, beside the poses that the controller
-    states."""
+    """Observe the wrong arm with the wrong scanner, and its hole circles.
+
+    Beside the poses that the controller states.
+    """
     stated, real = flange_poses(arm, q, np.zeros((arm.n, 6))), flange_poses(arm, q, errors)
     out, patterns = [], {}
     for i, X in enumerate(inverse(X_BC) @ real):
         p = X[:3, 3] + _REPEAT_M * rng.normal(size=3)
         # the face is where the scanner puts the ends of two of its diameters
-        a, b = (_distorted(p + _REACH_M * X[:3, k], bend) - _distorted(p - _REACH_M * X[:3, k], bend) for k in (0, 1))
+        a, b = (distorted(p + _REACH_M * X[:3, k], bend) - distorted(p - _REACH_M * X[:3, k], bend) for k in (0, 1))
         ratio = float(np.linalg.norm(a) + np.linalg.norm(b)) / (4.0 * _REACH_M) + _RATIO * rng.normal()
         z = np.cross(a, b)
         z = exp_rotation(_NORMAL_RAD * rng.normal(size=3)) @ (z / np.linalg.norm(z))
-        c = _distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
+        c = distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
         out.append(_observation(f"{name}{i}", stated[i], c, z))
         X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), c)
         patterns[out[-1].id] = _circle(X_CR, c, ratio)
     return out, patterns
 
 
-def _distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
+def distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
+    """Where a scanner with errors in scale, gradient (2,) and radial distortion puts a point (3,) m of its frame."""
     scale, gradient, radial = bend
     x = p[:2] / p[2]
     return np.asarray(p * (1.0 + scale + gradient @ p[:2] + radial * float(x @ x)))
@@ -295,8 +306,11 @@ def _distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
 
 @dataclass(frozen=True)
 class Found:
-    """One world: errors (m,) m at new scans of the plain and of the refined calibration, whether they lie in the stated
-    95 % regions, and the joint offsets' errors in units of their sigma."""
+    """Hold the errors of one world.
+
+    Errors (m,) m at new scans of the plain and of the refined calibration, whether they lie in the stated 95 % regions,
+    and the joint offsets' errors in units of their sigma.
+    """
 
     plain_m: Array
     refined_m: Array
@@ -305,8 +319,10 @@ class Found:
 
 
 def study_station(world: WrongArmStation, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
-    """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new
-    scans."""
+    """Calibrate one world plain, with the choice of the scanner's correction, and refined.
+
+    Both are judged on its new scans.
+    """
     arm = load_chain("ur10e")
     sought: ArmErrors = arm_errors(arm, kind, prior)
     X_BC, correction = solve_jointly(world.observations, world.patterns)
@@ -336,8 +352,10 @@ def study_station(world: WrongArmStation, kind: str = "links", prior: FactoryPri
 
 
 def judged(worlds: Sequence[Found]) -> dict[str, float]:
-    """Mean errors (mm) at new scans before and after, the share inside the stated regions, and of offsets within three
-    sigma."""
+    """Compute mean errors (mm) at new scans before and after, and two shares.
+
+    The share inside the stated regions, and of offsets within three sigma.
+    """
     before, after = (1e3 * np.concatenate([getattr(f, name) for f in worlds]) for name in ("plain_m", "refined_m"))
     off = np.concatenate([np.abs(f.offsets_sigma) for f in worlds])
     return {

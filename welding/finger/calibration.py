@@ -1,5 +1,7 @@
-"""Calibrates the finger: the camera's intrinsics from pictures of a board, the tag's size and the tip from touches on a
-plate."""
+"""Calibrates the finger.
+
+The camera's intrinsics from pictures of a board, the tag's size and the tip from touches on a plate.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,9 +25,11 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FingerIntrinsics:
-    """A camera: K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the
-    pictures that were used and of those that were not, their numbers, and the standard deviation of the focal length in
-    px."""
+    """Hold a calibrated camera.
+
+    K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the pictures that were
+    used and of those that were not, their numbers, and the standard deviation of the focal length in px.
+    """
 
     K: Array
     distortion: Array
@@ -59,8 +63,10 @@ class TipCalibration:
 
 
 def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tuple[Array, Array] | None:
-    """Corners of the board in a grey picture: points on the board (n, 3) m and pixels (n, 2); None where too few are
-    seen."""
+    """Corners of the board in a grey picture: points on the board (n, 3) m and pixels (n, 2).
+
+    None where too few are seen.
+    """
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
     if corners is None or len(corners) < FEWEST_CORNERS:
         return None
@@ -70,8 +76,9 @@ def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tup
 
 
 def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> FingerIntrinsics:
-    """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture; every fourth picture is held
-    out.
+    """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture.
+
+    Every fourth picture is held out.
 
     Zhang, A flexible new technique for camera calibration, 2000, with two radial and two tangential coefficients
     (OpenCV).
@@ -185,8 +192,10 @@ def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = Non
 
 
 def _similar(a: Array, b: Array, turned: bool) -> tuple[float, Array, Array]:
-    """Scale, rotation (3, 3) and shift (3,) with b = scale R a + shift; without the rotation where `turned` is
-    false."""
+    """Scale, rotation (3, 3) and shift (3,) with b = scale R a + shift.
+
+    Without the rotation where `turned` is false.
+    """
     a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
     R = np.eye(3)
     if turned:

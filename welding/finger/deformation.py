@@ -36,9 +36,7 @@ class TagModel:
     size_m: float = 0.010
 
     def __post_init__(self) -> None:
-        if self.dictionary not in _DICTIONARIES:
-            raise TagError(f"Unknown tag dictionary '{self.dictionary}'; use one of {', '.join(_DICTIONARIES)}.")
-        if not 0 <= self.id < len(_dictionary(self.dictionary).bytesList):
+        if not 0 <= self.id < len(dictionary_named(self.dictionary).bytesList):
             raise TagError(f"Tag id {self.id} is not in dictionary {self.dictionary}.")
         if not (np.isfinite(self.size_m) and self.size_m > 0.0):
             raise TagError(f"The side of a tag must be a positive length in metres, not {self.size_m}.")
@@ -216,9 +214,7 @@ def detect_tag(
     return TagObservation(True, "", X_KM, corners, error, covariance, quality)
 
 
-def deflection_from_tag(
-    X_KM: RigidTransform, X_KM_rest: RigidTransform, R_TK: RotationMatrix, gain: float = 1.0
-) -> Array:
+def deflection_from_tag(X_KM: RigidTransform, X_KM_rest: RigidTransform, R_TK: RotationMatrix) -> Array:
     """The tip's displacement from rest, p_T(tip) - p_T(rest), (3,) m in the tip frame T.
 
     The paper's delta (Eq. 15) is P_r - P_s: the negative of this, turned into the base.
@@ -226,11 +222,5 @@ def deflection_from_tag(
     Args:
         X_KM: the tag now; X_KM_rest: the tag with the tip free.
         R_TK: orientation of the finger camera in T.
-        gain: tag displacement per tip displacement, from the touch-on calibration.
-
-    Raises:
-        TagError: gain is zero or not finite.
     """
-    if not np.isfinite(gain) or abs(gain) < 1e-3:
-        raise TagError(f"The gain from tip to tag must be a finite number away from zero, not {gain}.")
-    return np.asarray(R_TK.matrix() @ (np.asarray(X_KM.translation()) - np.asarray(X_KM_rest.translation())) / gain)
+    return np.asarray(R_TK.matrix() @ (np.asarray(X_KM.translation()) - np.asarray(X_KM_rest.translation())))

@@ -102,8 +102,10 @@ def find_bent_faces(
 
 
 def _normals(points: Floats, rng: np.random.Generator, least_radius_m: float) -> tuple[Floats, Floats]:
-    """Some points (M,3) and the normals (M,3) of the surface there, up; those at edges are left out, but none for a
-    bend of that radius or a wider one."""
+    """Some points (M,3) and the normals (M,3) of the surface there, up.
+
+    Those at edges are left out, but none for a bend of that radius or a wider one.
+    """
     sample = points[rng.choice(len(points), size=min(len(points), 16 * SEEDS), replace=False)]
     seeds = sample[: min(SEEDS, len(sample))]
     near = sample[cKDTree(sample).query(seeds, k=min(NEIGHBOURS, len(sample)))[1]]
@@ -162,8 +164,10 @@ def _centred(face: BentFace, at: Floats, normal: Floats) -> BentFace:
 
 
 def _turns(face: BentFace, x: Floats, normal: Floats) -> bool:
-    """Whether the normals (M,3) rotate with the arc length x (M,) as on that cylinder; those of a tangent plane do
-    not."""
+    """Whether the normals (M,3) rotate with the arc length x (M,) as on that cylinder.
+
+    Those of a tangent plane do not.
+    """
     n = normal @ face.X_AQ.rotation().matrix()
     off = np.arctan2(n[:, 0], n[:, 2]) - x / face.radius_m
     # Strip by strip around it: a mixture of planes agrees on the whole, but in no strip.

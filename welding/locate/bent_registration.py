@@ -118,7 +118,7 @@ def _refine(
     radius, outline = workpiece.bend_radius_m, workpiece.outline_P
     core = outline * (1.0 - 0.012 / np.abs(outline).max())
     slants = _slants(outline, radius, None if eye_B is None else into(X_BP, eye_B[None])[0])
-    inset, fit_rms, noise, band = 0.0, math.inf, 0.0, 0.0
+    inset, noise, band = 0.0, 0.0, 0.0
     covariance = np.zeros((6, 6))
     u = unrolled(into(X_BP, points), radius)
     near_edge, middle = (
@@ -149,18 +149,15 @@ def _refine(
         step = max(1, len(flat) // FACE_POINTS)
         crowd = points_per_independent(u[flat], point_pitch(u[flat][:, :2])) / step
         seen = _Seen(p[flat[::step]], edge_p[rims[:, 2].astype(np.int64)], edges, pitch, noise, crowd)
-        X_PP, inset, fit_rms, covariance = _fit(seen, outline, radius, slants)
+        X_PP, inset, covariance = _fit(seen, outline, radius, slants)
         X_BP = X_BP @ X_PP
     u = into_plate(X_BP, points, workpiece)
-    inside = inside_loops(u[:, :2], [core])
-    on_face = (np.abs(u[:, 2]) < band) & inside
+    on_face = (np.abs(u[:, 2]) < band) & inside_loops(u[:, :2], [core])
     _same_bend(u[on_face], workpiece, noise)
     supported, contradicted = agreement(u, workpiece, band, pitch, inset, config)
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(u[on_face, 2])))),
-        outline_rms_m=fit_rms,
-        inlier_fraction=float(np.count_nonzero(on_face) / np.count_nonzero(inside)),
         supported=supported,
         contradicted=contradicted,
         confidence=max(0.0, supported - contradicted),
@@ -170,12 +167,8 @@ def _refine(
     )
 
 
-def _fit(
-    seen: _Seen, outline: Floats, radius: float, slants_rad: Floats
-) -> tuple[RigidTransform, float, float, Floats]:
-    """The small motion of P in P that fits face and rims, the inset, the rms of the rims about the outline, and the
-    covariance (6,6), rotation then translation.
-    """
+def _fit(seen: _Seen, outline: Floats, radius: float, slants_rad: Floats) -> tuple[RigidTransform, float, Floats]:
+    """Fit the small motion of P in P to face and rims: it, the inset, and the covariance (6,6), rotation first."""
     a, inward = outline[seen.edges], inward_normals(outline)[seen.edges]
     pitch = seen.pitch
     # A floor independent of the number of points: a real plate deviates from a cylinder in a few long waves.
@@ -221,12 +214,14 @@ def _fit(
         middle += np.outer(together, together) * (hidden + common[edge] ** 2)
     covariance = middle[:6, :6] + np.diag([0.0] * 5 + [HEIGHT_FLOOR_M**2])
     X = RigidTransform(RollPitchYaw(fit.x[:3]), fit.x[3:6])
-    return X, float(fit.x[6]), float(np.sqrt(np.mean(np.square(rims)))), np.asarray(covariance)
+    return X, float(fit.x[6]), np.asarray(covariance)
 
 
 def _slants(outline: Floats, radius: float, eye_P: Floats | None) -> Floats:
-    """For each edge (k,) the angle between the face's normal at its middle and the sight: the ends of the plate
-    lean."""
+    """For each edge (k,) the angle between the face's normal at its middle and the sight.
+
+    The ends of the plate lean.
+    """
     middle = 0.5 * (outline + np.roll(outline, -1, axis=0))
     angle = middle[:, 0] / radius
     if eye_P is None:

@@ -7,7 +7,7 @@ outline is symmetric the groove decides, if it is drawn asymmetrically and can b
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,13 +15,13 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
-from weldcal.models.errors import InputError
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.bent_registration import RADIUS_SHARE, flattened, into_plate
 from weldcal.welding.locate.planes import (
     PLANE_BAND_M,
     Floats,
+    finite_points,
     into,
     point_pitch,
     robust_plane,
@@ -38,35 +38,18 @@ from weldcal.welding.locate.registration import (
 
 COARSE_POINTS = 120_000
 CLOSE_M, CLOSE_RAD = 0.004, math.radians(1.5)  # how far the coarse place may be off
+STEEPEST_RAD = math.radians(20.0)  # largest tilt of the part's face from the up direction
+CELL_M, TURN_STEP_RAD = 0.004, math.radians(4.0)  # of the coarse search
+CANDIDATES = 6  # places that are registered finely
+AMBIGUOUS = 0.9  # a runner-up whose score is above this share of the best one's is as good
+GROOVE_REACH_M = 0.006  # how far the real groove may lie from the drawn one
+LEAST_GROOVE = 0.2  # smallest agreement (-1 to 1) of the groove seen with the one drawn
+FINE = RegistrationConfig(max_shift_m=0.010, max_turn_rad=math.radians(4.0))
+SEED = 0
 
 
 class AmbiguousWorkpiece(WorkpieceNotFound):
     """The scan agrees with two positions or two orientations of the part, and nothing distinguishes them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FindConfig:
-    """Settings of the search, and the thresholds of its decision.
-
-    steepest_rad     largest tilt of the part's face from the up direction
-    cell_m, turn_step_rad   of the coarse search
-    candidates       places that are registered finely
-    ambiguous        a runner-up whose score is above this share of the best one's is as good
-    groove_reach_m   how far the real groove may lie from the drawn one
-    least_groove     smallest agreement (-1 to 1) of the groove seen with the one drawn
-    """
-
-    steepest_rad: float = math.radians(20.0)
-    cell_m: float = 0.004
-    turn_step_rad: float = math.radians(4.0)
-    candidates: int = 6
-    ambiguous: float = 0.9
-    groove_reach_m: float = 0.006
-    least_groove: float = 0.2
-    fine: RegistrationConfig = field(
-        default_factory=lambda: RegistrationConfig(max_shift_m=0.010, max_turn_rad=math.radians(4.0))
-    )
-    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +57,13 @@ class FoundWorkpiece:
     """The pose of the part found, and its confidence.
 
     registration  the fine registration at the place found
-    runner_up     score of the next best other place over that of this one, 0 to 1
     groove        agreement of the groove seen with the one drawn here, -1 to 1; None where it could not be seen
-    turned_groove the same, with the part turned by 180 deg
     confidence    0 to 1: supported less contradicted share of the outline, reduced by the runner-up
     summary       the result in one sentence
     """
 
     registration: WorkpieceRegistration
-    runner_up: float
     groove: float | None
-    turned_groove: float | None
     confidence: float
     summary: str
 
@@ -100,7 +79,6 @@ def find_workpiece(
     *,
     turn_hint_rad: float | None = None,
     eye_B: npt.ArrayLike | None = None,
-    config: FindConfig | None = None,
 ) -> FoundWorkpiece:
     """Find the plate in a scan (N,3) or (H,W,3), metres in base with z up, at any position and turn about z.
 
@@ -110,18 +88,13 @@ def find_workpiece(
     Raises:
         WorkpieceNotFound, AmbiguousWorkpiece: in a sentence; InputError for a scan of the wrong shape.
     """
-    config = config or FindConfig()
-    points = np.asarray(points_B, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < config.fine.min_points:
+    (points,) = finite_points([points_B])
+    if len(points) < FINE.min_points:
         raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
     # A thinned scan is enough to find the place; the final registration uses all points.
     few = thinned(points, COARSE_POINTS)
-    coarse = config.fine if few is points else replace(config.fine, max_sigma_m=math.inf)
-    places = _places(few, workpiece, config)
+    coarse = FINE if few is points else replace(FINE, max_sigma_m=math.inf)
+    places = _places(few, workpiece)
     bent = math.isfinite(workpiece.bend_radius_m)
     if not places:
         what = f"face bent over {1e3 * workpiece.bend_radius_m:.0f} mm" if bent else "flat face"
@@ -144,7 +117,7 @@ def find_workpiece(
     judged = []
     for score, found in fits:
         turns = [found] if not _half_turn_fits(workpiece) else [found, found.turned_round(workpiece)]
-        grooves = _groove_agreement(few, workpiece, [t.X_BP for t in turns], config)
+        grooves = _groove_agreement(few, workpiece, [t.X_BP for t in turns])
         judged.append((score, turns, grooves))
     judged.sort(key=lambda j: -(j[0] + max((g for g in j[2] if g is not None), default=0.0)))
     _, turns, grooves = judged[0]
@@ -152,17 +125,17 @@ def find_workpiece(
     if len(judged) > 1:
         mine, theirs = (s * (1.0 + max((g for g in gs if g is not None), default=0.0)) for s, _, gs in judged[:2])
         other = max(0.0, theirs) / max(mine, 1e-9)
-    if other > config.ambiguous:
+    if other > AMBIGUOUS:
         a, b = (1e3 * j[1][0].X_BP.translation() for j in judged[:2])
         raise AmbiguousWorkpiece(
             f"Two places in the scan look equally like the {workpiece.name}: near ({a[0]:.0f}, {a[1]:.0f}) and "
             f"({b[0]:.0f}, {b[1]:.0f}) mm; cover or remove one, or give a guess of where the part is."
         )
     if few is not points:
-        close = replace(config.fine, max_shift_m=CLOSE_M, max_turn_rad=CLOSE_RAD)
+        close = replace(FINE, max_shift_m=CLOSE_M, max_turn_rad=CLOSE_RAD)
         exact = register_workpiece(points, workpiece, turns[0].X_BP, close, eye_B)
         turns = [exact, exact.turned_round(workpiece)][: len(turns)]
-    return _decided(workpiece, turns, grooves, other, turn_hint_rad, config)
+    return _decided(workpiece, turns, grooves, other, turn_hint_rad)
 
 
 def _decided(
@@ -171,11 +144,10 @@ def _decided(
     grooves: list[float | None],
     other: float,
     turn_hint_rad: float | None,
-    config: FindConfig,
 ) -> FoundWorkpiece:
     """Choose between the two turns and return the result with its confidence; raise where nothing decides."""
     seen = [g for g in grooves if g is not None]
-    if seen and max(seen) < config.least_groove:
+    if seen and max(seen) < LEAST_GROOVE:
         raise WorkpieceNotFound(
             f"A plate of the size of the {workpiece.name} is there, but its groove is not where the drawing has one: "
             "check which workpiece this is."
@@ -207,47 +179,46 @@ def _decided(
         f"{word} confidence {confidence:.2f}: {found.summary}; the next best place is {100 * other:.0f} % as good, and"
         f" {why}"
     )
-    turned_groove = grooves[1 - chosen] if len(grooves) == 2 else None
-    return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, summary)
+    return FoundWorkpiece(found, grooves[chosen], confidence, summary)
 
 
-def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
+def _places(points: Floats, workpiece: Workpiece) -> list[tuple[float, RigidTransform]]:
     """Rough poses of the outline on the faces in view, best first."""
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(SEED)
     if math.isfinite(workpiece.bend_radius_m):
-        return _bent_places(points, workpiece, config, rng)
+        return _bent_places(points, workpiece, rng)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
     center = np.median(sample, axis=0)
     places: list[tuple[float, RigidTransform]] = []
-    for X in upward_planes(sample - center, config.steepest_rad, 120, rng, most=6):
+    for X in upward_planes(sample - center, STEEPEST_RAD, 120, rng, most=6):
         X_BQ = RigidTransform(center) @ X
         q = into(X_BQ, points)
-        places += [(score, X_BQ @ X_QP) for score, X_QP in _correlate(q, workpiece, config)]
+        places += [(score, X_BQ @ X_QP) for score, X_QP in _correlate(q, workpiece)]
     places.sort(key=lambda place: -place[0])
-    return places[: config.candidates]
+    return places[:CANDIDATES]
 
 
-def _bent_places(
-    points: Floats, workpiece: Workpiece, config: FindConfig, rng: np.random.Generator
-) -> list[tuple[float, RigidTransform]]:
+def _bent_places(points: Floats, workpiece: Workpiece, rng: np.random.Generator) -> list[tuple[float, RigidTransform]]:
     """Rough poses on the bent faces in view; only half turns about the cylinder's normal are possible there."""
     radius = workpiece.bend_radius_m
     places: list[tuple[float, RigidTransform]] = []
     for seen in find_bent_faces(points, ((1.0 - RADIUS_SHARE) * radius, (1.0 + RADIUS_SHARE) * radius), rng):
         face = BentFace(seen.X_AQ, radius)
-        for score, X in _correlate(face.unrolled(points), workpiece, config, (0.0, math.pi)):
+        for score, X in _correlate(face.unrolled(points), workpiece, (0.0, math.pi)):
             x, y, _ = X.translation()
             places.append((score, face.at(float(x), float(y), _heading(X))))
     places.sort(key=lambda place: -place[0])
-    return places[: config.candidates]
+    return places[:CANDIDATES]
 
 
 def _correlate(
-    q: Floats, workpiece: Workpiece, config: FindConfig, only: tuple[float, ...] | None = None
+    q: Floats, workpiece: Workpiece, only: tuple[float, ...] | None = None
 ) -> list[tuple[float, RigidTransform]]:
-    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by
-    correlation."""
-    cell = config.cell_m
+    """The few best poses of the outline in one plane.
+
+    Turns by template (`only` these, where given), places by correlation.
+    """
+    cell = CELL_M
     reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
     corner = q[:, :2].min(axis=0) - 0.3 * reach
     size = np.ceil((q[:, :2].max(axis=0) + 0.3 * reach - corner) / cell).astype(int)
@@ -263,7 +234,7 @@ def _correlate(
     if min(seen.shape) <= 2 * pad:
         return []
     best: list[tuple[float, RigidTransform]] = []
-    turns = np.arange(0.0, math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi, config.turn_step_rad)
+    turns = np.arange(0.0, math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi, TURN_STEP_RAD)
     if only is not None:
         turns = np.array(only[:1] if _half_turn_fits(workpiece) else only)
     for turn in turns:
@@ -318,9 +289,7 @@ def _same_place(A: RigidTransform, B: RigidTransform, workpiece: Workpiece) -> b
     return float(np.linalg.norm(E.translation())) < 0.012 and turn < math.radians(8.0)
 
 
-def _groove_agreement(
-    points: Floats, workpiece: Workpiece, poses: list[RigidTransform], config: FindConfig
-) -> list[float | None]:
+def _groove_agreement(points: Floats, workpiece: Workpiece, poses: list[RigidTransform]) -> list[float | None]:
     """For each pose: the drawn seam's share with a groove below it, less the share of what is below it elsewhere."""
     half_width = workpiece.half_width_m
     drawn_flat = flattened(workpiece)
@@ -341,7 +310,7 @@ def _groove_agreement(
         if len(low) < 40 or len(drawn) < 20:
             out.append(None)
             continue
-        reach = config.groove_reach_m
+        reach = GROOVE_REACH_M
         seen = np.asarray(cKDTree(plane[:, :2]).query(drawn)[0]) < 3.0 * half_width
         hit = np.asarray(cKDTree(low).query(drawn)[0]) < max(reach, pitch)
         miss = np.asarray(cKDTree(line[::4, :2]).query(low)[0]) > half_width + reach

@@ -99,9 +99,10 @@ def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple
 
 def fit_outline(
     rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None, noise: float
-) -> tuple[RigidTransform, float, float, Floats]:
-    """Fit the in-plane motion that puts outermost points (M,2) on their edges; the inset, the remaining rms, m, and
-    the covariance (3,3) of x, y and turn.
+) -> tuple[RigidTransform, float, Floats]:
+    """Fit the in-plane motion that puts outermost points (M,2) on their edges.
+
+    The inset, m, and the covariance (3,3) of x, y and turn.
 
     The scanner's last point on the face lies up to a pitch inside the edge; that inset is one more unknown, the same at
     all edges and held near half a pitch, so that it cancels where opposite edges are seen.
@@ -126,9 +127,8 @@ def fit_outline(
         bounds=(np.append(-limit, -0.1 * pitch), np.append(limit, 1.3 * pitch)),
     )
     off = residuals(fit.x)[:-1]
-    rms = float(np.sqrt(np.mean(np.square(off))))
     covariance = outline_covariance(np.asarray(fit.jac), off, edges, pitch, prior, slant_rad, noise)
-    return turned(*fit.x[:3]), float(fit.x[3]), rms, covariance
+    return turned(*fit.x[:3]), float(fit.x[3]), covariance
 
 
 def displaced(

@@ -1,6 +1,7 @@
 """Finds upward planes in a scan, frames on them, and rasters of the points on and below a face."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import cKDTree
+
+from weldcal.models.errors import InputError
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -33,6 +36,22 @@ class Raster:
         return np.asarray(cells[y * inside, x * inside])
 
 
+def finite_points(points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]]) -> list[Floats]:
+    """Select the measured points (N,3) of each scan, (N,3) or (H,W,3), of a list or alone.
+
+    Raises:
+        InputError: a scan has another shape.
+    """
+    found = []
+    for one in points_B if isinstance(points_B, list | tuple) else [points_B]:
+        points = np.asarray(one, dtype=np.float64)
+        if points.ndim < 2 or points.shape[-1] != 3:
+            raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
+        points = points.reshape(-1, 3)
+        found.append(np.asarray(points[np.isfinite(points).all(axis=1)]))
+    return found
+
+
 def into(X_AB: RigidTransform, p_A: Floats) -> Floats:
     """Points (N,3) given in A, expressed in B."""
     return np.asarray((p_A - X_AB.translation()) @ X_AB.rotation().matrix(), dtype=np.float64)
@@ -53,8 +72,10 @@ def plane_frame(normal: Floats, center: Floats) -> RigidTransform:
 def upward_planes(
     sample: Floats, steepest_rad: float, least_points: int, rng: np.random.Generator, most: int = 4
 ) -> list[RigidTransform]:
-    """Up to `most` planes through points (N,3) whose normals lie within an angle of z, most points first, as frames
-    Q."""
+    """Find up to `most` planes through points (N,3) whose normals lie within an angle of z, as frames Q.
+
+    Most points first.
+    """
     planes: list[RigidTransform] = []
     rest = sample
     steepest = math.cos(steepest_rad)

@@ -16,13 +16,12 @@ from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
-from weldcal.welding.locate.part.fit import into
 from weldcal.welding.locate.part.joint import MOST_M, REACH_M, FitUp, MeasuredJoint, measure_fit_up, measure_joint
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_prepared
 from weldcal.welding.locate.part.result import PartConfig, PartRegistration
-from weldcal.welding.locate.part.scan import finite_points, prepare
-from weldcal.welding.locate.planes import Floats
+from weldcal.welding.locate.part.scan import prepare
+from weldcal.welding.locate.planes import Floats, finite_points, into
 from weldcal.welding.locate.registration import register_workpiece
 
 METHODS = ("cad", "cloud")

@@ -32,9 +32,10 @@ def outline_covariance(
     slant_rad: float | None,
     noise: float,
 ) -> Floats:
-    """(3,3) of x, y, turn from the Jacobian (M+1,4) of the outline fit, whose last row is the inset's prior, and the
-    distances (M,) of the outermost points from their edges, m. slant_rad: between the face's normal and the sight;
-    noise of the face, m.
+    """Compute the covariance (3,3) of x, y and turn of the outline fit.
+
+    From its Jacobian J (M+1,4), whose last row is the inset's prior, and the distances `off` (M,) of the outermost
+    points from their edges, m. slant_rad: between the face's normal and the sight; noise: of the face, m.
     """
     slant = math.tan(USUAL_SLANT_RAD if slant_rad is None else slant_rad)
     G = np.linalg.inv(J.T @ J) @ J.T

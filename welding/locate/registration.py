@@ -17,12 +17,20 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
 
-from weldcal.models.errors import InputError
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_registration import register_bent
 from weldcal.welding.locate.outline_fit import by_the_edge, fit_outline, outermost, slide
-from weldcal.welding.locate.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, upward_planes
+from weldcal.welding.locate.planes import (
+    PLANE_BAND_M,
+    Floats,
+    finite_points,
+    into,
+    point_pitch,
+    robust_plane,
+    thinned,
+    upward_planes,
+)
 from weldcal.welding.locate.pose_covariance import pose_covariance
 from weldcal.welding.locate.registration_result import (
     RegistrationConfig,
@@ -53,11 +61,7 @@ def register_workpiece(
     """
     config = config or RegistrationConfig()
     eye = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
-    points = np.asarray(points_B, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    (points,) = finite_points([points_B])
     if math.isfinite(workpiece.bend_radius_m):
         return register_bent(points, workpiece, X_BP_guess, config, eye)
     half = 0.5 * np.array(workpiece.size_m[:2])
@@ -103,7 +107,7 @@ def _refine(
         slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
     band = max(4.0 * sigma, 0.0003)
     pitch = point_pitch(into(X_PQ, p[above])[:, :2])
-    inset, fit_rms = 0.0, math.inf
+    inset = 0.0
     for gate in (0.008, 0.004, 0.002):
         p = into(X_BP, near_edge)
         # Points a little below the face are the side of the plate and would shift the edges that face the scanner.
@@ -111,19 +115,16 @@ def _refine(
         rims, edges = outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise not_found(workpiece, "too little of its outline is in view.")
-        X_PP, inset, fit_rms, in_plane = fit_outline(rims, edges, outline, pitch, slant, sigma)
+        X_PP, inset, in_plane = fit_outline(rims, edges, outline, pitch, slant, sigma)
         X_BP = X_BP @ X_PP
 
     p = into(X_BP, points)
     supported, contradicted = agreement(p, workpiece, band, pitch, inset, config)
-    inside = inside_loops(p[:, :2], [core])
-    on_face = (np.abs(p[:, 2]) < band) & inside
+    on_face = (np.abs(p[:, 2]) < band) & inside_loops(p[:, :2], [core])
     covariance = pose_covariance(p[on_face], in_plane, pitch)
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(p[on_face, 2])))),
-        outline_rms_m=fit_rms,
-        inlier_fraction=float(np.count_nonzero(on_face) / np.count_nonzero(inside)),
         supported=supported,
         contradicted=contradicted,
         confidence=max(0.0, supported - contradicted),

@@ -42,8 +42,6 @@ class WorkpieceRegistration:
     """The pose X_BP of the plate (frame P of models.workpieces.plate), and how well the scan agrees with it.
 
     rms_m             rms distance of the face's points from its plane, m
-    outline_rms_m     rms distance of the face's outermost points from the outline, m (0.3 pixel pitches or so)
-    inlier_fraction   share of the points above the plate's area that lie on its face (the groove and clutter do not)
     supported, contradicted   shares of the outline where the scan confirms, or contradicts, that the face ends there
     confidence        supported less contradicted, 0 to 1
     n_points          points on the face
@@ -54,8 +52,6 @@ class WorkpieceRegistration:
 
     X_BP: RigidTransform
     rms_m: float
-    outline_rms_m: float
-    inlier_fraction: float
     supported: float
     contradicted: float
     confidence: float

@@ -1,5 +1,7 @@
-"""Signs of trouble in a weld log: a tag that is no longer seen, and a tip whose tag moves otherwise than it was
-calibrated."""
+"""Signs of trouble in a weld log.
+
+A tag that is no longer seen, and a tip whose tag moves otherwise than it was calibrated.
+"""
 
 import numpy as np
 

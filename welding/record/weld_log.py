@@ -1,5 +1,7 @@
-"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each
-column."""
+"""Writes and reads the weld log.
+
+A CSV with one row per servo tick and a JSON header with the meaning and unit of each column.
+"""
 
 import csv
 import hashlib

@@ -1,5 +1,7 @@
-"""Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel
-angle."""
+"""Computes the motion that a planned seam requires of a tool whose torch trails its tip.
+
+Turn, speed and travel angle.
+"""
 
 import math
 from dataclasses import dataclass
@@ -17,8 +19,8 @@ class ChordMap:
     Attributes:
         s_torch, s_tip: (n,) arc lengths m of the two ends of the chord.
         turn: (n,) psi_r - psi_t in rad; max_turn: the largest, unsigned.
-        cos_tip, cos_torch: (n,) t_s . u and n_d . n_t.
-        conditioning: (n,) sqrt(cos_tip^2 + cos_torch^2); min_conditioning: the least.
+        cos_torch: (n,) n_d . n_t.
+        conditioning: (n,) sqrt((t_s . u)^2 + cos_torch^2); min_conditioning: the least.
         tip_speed, torch_speed: (n,) m/s that the projective law gives; speed_loss: largest share of torch speed lost.
         travel: (n,) rad, travel angle: pitch of the chord against the surface at the torch, negative nose down.
         back_up_m: how far the torch must run backwards.
@@ -27,7 +29,6 @@ class ChordMap:
     s_torch: Array
     s_tip: Array
     turn: Array
-    cos_tip: Array
     cos_torch: Array
     conditioning: Array
     tip_speed: Array
@@ -54,11 +55,6 @@ class ChordMap:
         """Largest relative loss of torch speed caused by the limits, 0..1."""
         top = float(np.max(self.torch_speed))
         return min(1.0, 1.0 - float(np.min(self.torch_speed)) / top) if top > 0.0 else 1.0
-
-    @property
-    def max_travel(self) -> float:
-        """Largest travel angle, unsigned, rad."""
-        return float(np.max(np.abs(self.travel)))
 
     def travel_at(self, s: Array) -> Array:
         """The predicted travel angle rad where the torch is at arc length s (n,) m."""
@@ -128,7 +124,6 @@ def chord_map(
         s_torch=s_torch,
         s_tip=s_tip,
         turn=turn,
-        cos_tip=cos_tip,
         cos_torch=cos_torch,
         conditioning=conditioning,
         tip_speed=scale * cos_torch,
@@ -138,8 +133,10 @@ def chord_map(
 
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:
-    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's
-    path is shorter."""
+    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths.
+
+    On the inside of a bend the tip's path is shorter.
+    """
     x, y, z, tx, ty, tz, nx, ny, nz, _, _, _, curvature = plan.frame_numbers(tip)
     at_x, at_y, at_z, to_x, to_y, to_z, *_ = plan.frame_numbers(torch)
     x, y, z = x - at_x, y - at_y, z - at_z

@@ -38,8 +38,10 @@ WIRE_M = 0.001  # radius of the wire with its play
 
 
 class NoClearance(WeldcalError):
-    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too
-    small."""
+    """The tool's body would touch the part while the tip is in the joint.
+
+    `short_m`: by how much its clearance is too small.
+    """
 
     def __init__(self, sentence: str, short_m: float) -> None:
         super().__init__(sentence)
@@ -92,8 +94,9 @@ def check_beside(
     stops: list[float] | None = None,
     from_m: float = 0.0,
 ) -> None:
-    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the
-    tool.
+    """Check that nothing that a scan (N,3) shows and the drawing does not is in the way of the tool.
+
+    Such as a clamp or a tack.
 
     Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below
     `table_z_m` it is the table. Where `stops` is given, the places of the tip at which something is in the way are
@@ -153,8 +156,9 @@ def check_beside(
 def clear_pieces(
     seam: SeamCurve, stops: Sequence[float], chord_m: float, run_up_m: float
 ) -> list[tuple[float, float, float]]:
-    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the
-    tip comes down, m.
+    """Split a seam where something is in the way of the tool.
+
+    For each piece its start and end and the place where the tip comes down, m.
 
     The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the
     torch has passed it, and `run_up_m` later, when the torch is on the seam.
@@ -171,8 +175,9 @@ def clear_pieces(
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
-    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its
-    start.
+    """Check that nothing of the part stands in the way of tip and torch beyond the seam's ends.
+
+    The tip needs the space beyond its end, the torch that before its start.
 
     The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as
     far behind its start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out
@@ -235,8 +240,9 @@ def _yields(
 
 
 def _crossings(triangles: NDArray[np.float64], origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their
-    inward normals.
+    """Compute the distances (K,) m at which a line along a unit vector crosses triangles (M,3,3).
+
+    With its cosines (K,) with their inward normals.
 
     Source: Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
     """

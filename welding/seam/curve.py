@@ -150,8 +150,10 @@ class SeamCurve:
 
     @property
     def drawn_m(self) -> float:
-        """The arc length in m up to which the groove is drawn: the seam's own, or more where the groove goes on past
-        its end."""
+        """The arc length in m up to which the groove is drawn.
+
+        The seam's own, or more where the groove goes on past its end.
+        """
         return float(self.knots[-1])
 
     def _pieces(self, s: Array) -> tuple[Array, Array, Array]:
@@ -201,8 +203,10 @@ class SeamCurve:
 
     @cached_property
     def _rows(self) -> Array:
-        """(n, 18), per piece: the cubic's 12 coefficients, highest power first, then the up-normals at its two
-        knots."""
+        """(n, 18), per piece.
+
+        The cubic's 12 coefficients, highest power first, then the up-normals at its two knots.
+        """
         return np.hstack([self.coefficients.reshape(len(self.coefficients), 12), self.ups[:-1], self.ups[1:]])
 
     @cached_property

@@ -165,8 +165,10 @@ def _sharpest(plan: SeamCurve) -> tuple[float, float]:
 
 
 def _splits(plan: SeamCurve, d: float, weld_speed: float, limits: SeamWindows, depth: int = 4) -> tuple[float, ...]:
-    """Arc lengths at which to split a seam that turns too far: the middle of the turn, and recursively in the
-    pieces."""
+    """Arc lengths at which to split a seam that turns too far.
+
+    The middle of the turn, and recursively in the pieces.
+    """
     chart = chord_map(plan, d, weld_speed, spacing=_SPACING_M)
     kinds = {p.kind for p in _problems(plan, chart, d, limits)}
     if not kinds or depth == 0 or plan.length < 0.030 or not kinds <= {"back-up", "conditioning", "cusp"}:

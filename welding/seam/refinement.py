@@ -42,8 +42,11 @@ class CornerConfig:
 
 @dataclass(frozen=True)
 class RoundedCorner:
-    """The points (n,3) m to put between the two sides, the path's length m from the last felt point to each, and the
-    whole length m from side to side; `middle`: the length m to the corner's middle."""
+    """Hold the points (n,3) m to put between the two sides of a corner.
+
+    With the path's length m from the last felt point to each, and the whole length m from side to side; `middle`: the
+    length m to the corner's middle.
+    """
 
     points: Array
     along: Array

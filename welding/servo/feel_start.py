@@ -47,8 +47,9 @@ def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:
 def feel_start_step(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, tuple[float, float, float], str | None, bool]:
-    """One tick: back until contact is lost or six millimetres past the plan's start; then up, and into the groove
-    again.
+    """One tick: back until contact is lost or six millimetres past the plan's start.
+
+    Then up, and into the groove again.
 
     Args:
         before: the state before this tick's frame, `is_new`: whether there is one.
@@ -98,22 +99,27 @@ def feel_start_step(
 
 
 def _start_found(before: WeldingState, state: WeldingState, now: float, config: ServoConfig) -> WeldingState:
-    """The state after contact was lost: the last uncertain points are dropped, and the seam starts where contact
-    ended."""
+    """The state after contact was lost.
+
+    The last uncertain points are dropped, and the seam starts where contact ended.
+    """
     assert before.measurement is not None
     assert state.plan_fit is not None
     felt = state.touch.felt[: max(0, len(state.touch.felt) - config.refinement.frames_to_commit)]
-    curve = state.plan_fit.curve
-    residual = np.zeros(2)
-    if felt:
-        last = np.array([q.point for q in felt[-8:]])
-        s = curve.project(last, state.s_tip, 0.02)
-        gap = last - curve.position(s)
-        residual = np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
+    residual = mean_residual(np.array([q.point for q in felt[-8:]]), state.plan_fit.curve, state.s_tip)
     touch = replace(state.touch, step="lift", since=now, felt=felt)
     return changed(
         state, touch=touch, residual_at_loss=residual, start_point=before.measurement.point, steer=0.0, felt=0.0
     )
+
+
+def mean_residual(points: Array, curve: SeamCurve, s_near: float) -> Array:
+    """Mean offset (2,) m of points (N,3) from a curve near an arc length, to the left and up; zero without points."""
+    if not len(points):
+        return np.zeros(2)
+    s = curve.project(points, s_near, 0.02)
+    gap = points - curve.position(s)
+    return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
 
 
 def _ready(state: WeldingState, p_BT: Array, config: ServoConfig) -> WeldingState:

@@ -21,23 +21,19 @@ class SeamConditioning(NamedTuple):
     """Conditioning of the chord on the seam.
 
     Attributes:
-        cos_tip, cos_torch: t_s . u at the two ends; cos_torch is the paper's n_d . n_t.
-        value: sqrt(cos_tip^2 + cos_torch^2). The paper's law needs cos_torch away from 0, the guarded one only this.
-        tip_ratio: tip speed per torch speed, cos_torch/cos_tip, held inside +-1e6.
+        cos_torch: t_s . u at the torch, the paper's n_d . n_t.
+        value: sqrt(cos_tip^2 + cos_torch^2), with t_s . u at the tip. The paper's law needs cos_torch away from 0, the
+            guarded one only this.
     """
 
-    cos_tip: float
     cos_torch: float
     value: float
-    tip_ratio: float
 
 
 def seam_conditioning(chord: Array, tangent_tip: Array, tangent_torch: Array) -> SeamConditioning:
     """Conditioning of n_d . n_t from the unit chord u and the unit seam tangents, each (3,); weld_law.md, section 3."""
     cos_tip, cos_torch = dot(tangent_tip, chord), dot(tangent_torch, chord)
-    off_zero = cos_tip if abs(cos_tip) > 1e-6 else (1e-6 if cos_tip >= 0.0 else -1e-6)
-    value = (cos_tip * cos_tip + cos_torch * cos_torch) ** 0.5
-    return SeamConditioning(cos_tip, cos_torch, value, cos_torch / off_zero)
+    return SeamConditioning(cos_torch, (cos_tip * cos_tip + cos_torch * cos_torch) ** 0.5)
 
 
 @dataclass(frozen=True)
@@ -124,8 +120,11 @@ def guarded_joint_velocity(
 def _guarded(
     J: Array, V: Array, bound: Array, row_scale: Array, stop: float, slow: float, q_dot: Array
 ) -> tuple[float, float, float]:
-    """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped),
-    and that near a singularity (below 0: an input is not finite)."""
+    """Fill q_dot (6,), which is zero.
+
+    Returns sigma_min, the share of the wanted velocity that is left (0: stopped), and that near a singularity (below 0:
+    an input is not finite).
+    """
     if not (np.isfinite(J).all() and np.isfinite(V).all() and np.isfinite(bound).all()):
         return 0.0, 0.0, -1.0
     scaled, wanted = J * row_scale.reshape(6, 1), V * row_scale

@@ -1,5 +1,7 @@
-"""Holds a weld and lets it go on: arc off and tool at rest; then back along its own path a little, and on with the
-arc."""
+"""Holds a weld and lets it go on: arc off and tool at rest.
+
+Then back along its own path a little, and on with the arc.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -67,8 +69,10 @@ class Interruption:
 
     @property
     def way_back(self) -> tuple[TrailPoint, ...]:
-        """What lies between the tool and the place where the weld goes on, that place first; empty without a way
-        back."""
+        """What lies between the tool and the place where the weld goes on, that place first.
+
+        Empty without a way back.
+        """
         return () if not self.step or math.isnan(self.at) else self.trail[self.goal : round(self.at) + 1]
 
     @property

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -84,22 +85,7 @@ def get_law(name: str) -> SteeringLaw:
 
 def motion_law(law: SteeringLaw) -> MotionLaw:
     """The function that computes one tick's motion under a law."""
-    if law.guarded:
-        return guarded_motion
-
-    def paper(
-        state: WeldingState,
-        X_BT: RigidTransform,
-        tip: SeamFrame,
-        target: TorchTarget,
-        servo: tuple[float, float],
-        config: ServoConfig,
-        dt: float,
-    ) -> TickMotion:
-        del dt  # the published law bounds no rate
-        return paper_motion(law, state, X_BT, tip, target, servo, config)
-
-    return paper
+    return guarded_motion if law.guarded else partial(paper_motion, law)
 
 
 def paper_motion(
@@ -110,11 +96,13 @@ def paper_motion(
     target: TorchTarget,
     servo: tuple[float, float],
     config: ServoConfig,
+    dt: float,
 ) -> TickMotion:
     """Algorithm 2, lines 8-14: V_r = V_const t + servo, omega from V_t . n_t = 0 (weld_law.md, section 2).
 
     The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
     """
+    del dt  # the published law bounds no rate
     limits, torch = config.limits, config.torch
     axes = tool_axes(X_BT, tip.up, target.up, config)
     u, m, a, d = axes.along, axes.across, axes.yaw, axes.d

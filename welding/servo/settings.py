@@ -1,5 +1,7 @@
-"""Settings of the welding servo in SI units, grouped by what they govern; the defaults are those of
-docs/weld_law.md."""
+"""Settings of the welding servo in SI units, grouped by what they govern.
+
+The defaults are those of docs/weld_law.md.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -76,8 +78,10 @@ class ServoConfigError(InputError):
 
 
 def _check_numbers(group: str, settings: object, signed: tuple[str, ...] = (), zero: tuple[str, ...] = ()) -> None:
-    """Raise ServoConfigError unless every number of a group is finite and positive; `zero` may be 0, `signed`
-    anything."""
+    """Raise ServoConfigError unless every number of a group is finite and positive.
+
+    `zero` may be 0, `signed` anything.
+    """
     for name, value in vars(settings).items():
         if isinstance(value, bool) or not isinstance(value, Real):
             continue

@@ -41,8 +41,10 @@ class DeflectionSample:
 
 @dataclass(frozen=True)
 class ServoSample:
-    """One servo tick's input: time s, pose of T in B now, the newest frame (the same again until a newer comes), and
-    whether the arc is established where the torch is on; True where nobody tells.
+    """One servo tick's input.
+
+    Time s, pose of T in B now, the newest frame (the same again until a newer comes), and whether the arc is
+    established where the torch is on; True where nobody tells.
     """
 
     time: float
@@ -114,10 +116,11 @@ class GainFit(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TouchOnState:
-    """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free
-    tip; `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held
-    the tip; `rest_m`: height above the plan at which the ball has come to rest; `raised_m`: of a ball seated above the
-    plan, its height there, slowly followed.
+    """State of the touch search: its step, the step's start, heights and lateral place.
+
+    `free`: deflections of the free tip; `felt`: points measured on the way back to the start, each with how far ahead
+    of its rest point friction held the tip; `rest_m`: height above the plan at which the ball has come to rest;
+    `raised_m`: of a ball seated above the plan, its height there, slowly followed.
     """
 
     step: str = "descend"

@@ -20,7 +20,7 @@ from weldcal.welding.servo.contact import (
     with_progress,
 )
 from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
-from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
+from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step, mean_residual
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig, weave_at
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
@@ -29,8 +29,10 @@ from weldcal.welding.servo.track import torch_target
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned
-    one."""
+    """Arc length m on the moved plan at which the arc starts.
+
+    The measured start of the groove, else the planned one.
+    """
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
@@ -46,8 +48,9 @@ def with_arc(state: WeldingState, sample: ServoSample) -> WeldingState:
 def wait_for_arc(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, Array, str | None]:
-    """One tick with the torch on and no arc: the next state, the motion (6,) that ramps to rest, and the reason to
-    stop.
+    """One tick with the torch on and no arc.
+
+    The next state, the motion (6,) that ramps to rest, and the reason to stop.
 
     No time of standing counts as a lack of progress.
     """
@@ -65,19 +68,14 @@ def wait_for_arc(
         advanced=(state.advanced[0], sample.time),
     )
     torch = config.torch
+    reason = None
     if not state.arc_seen and waited > torch.ignition_limit_s:
-        return (
-            state,
-            share * V_stop,
-            f"The arc was not established within {torch.ignition_limit_s:g} s; check the power source, wire and gas.",
+        reason = (
+            f"The arc was not established within {torch.ignition_limit_s:g} s; check the power source, wire and gas."
         )
-    if state.arc_seen and waited > torch.arc_lost_s:
-        return (
-            state,
-            share * V_stop,
-            f"The arc went out for {torch.arc_lost_s:g} s; check the power source, wire and gas.",
-        )
-    return state, share * V_stop, None
+    elif state.arc_seen and waited > torch.arc_lost_s:
+        reason = f"The arc went out for {torch.arc_lost_s:g} s; check the power source, wire and gas."
+    return state, share * V_stop, reason
 
 
 _THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
@@ -154,9 +152,9 @@ def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
     feels_start = config.felt and config.touch.feel_start and get_law(config.law).guarded
+    assert state.plan_fit is not None
+    seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
     if not config.felt:
-        assert state.plan_fit is not None
-        seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
         gap = seam.position - sample.X_BT.translation()
         aside, above = dot(gap, seam.normal), dot(gap, seam.up)
         seated = math.hypot(aside, above) < _THERE_M
@@ -166,8 +164,6 @@ def _touch(
         assert state.plan_fit is not None
         seam, seated = state.plan_fit.curve.frame(state.s_tip), False
     else:
-        assert state.plan_fit is not None
-        seam, along, ready = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False
         state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
@@ -236,12 +232,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
 def _tip_residual(state: WeldingState) -> Array:
     """Mean offset of the newest tactile points from the moved plan, (2,) m to the left and up."""
     assert state.plan_fit is not None
-    points, curve = state.refined.points[-8:], state.plan_fit.curve
-    if not len(points):
-        return np.zeros(2)
-    s = curve.project(points, state.s_tip, 0.02)
-    gap = points - curve.position(s)
-    return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
+    return mean_residual(state.refined.points[-8:], state.plan_fit.curve, state.s_tip)
 
 
 def _weld(
@@ -325,8 +316,10 @@ def _weld(
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
-    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and
-    FINISH."""
+    """The tip's wanted lateral and upward speed, m/s.
+
+    From the deflection in TRACK, from the moved plan in COAST and FINISH.
+    """
     deflection = config.deflection
     if state.phase == Phase.TRACK:
         # A late frame shows where the tip was, not where it is: its correction fades out.
@@ -354,8 +347,10 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 
 def _rest(state: WeldingState, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks: the clock may be
-    faulty."""
+    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks.
+
+    The clock may be faulty.
+    """
     share = clip(1.0 - state.stopped_ticks * config.period_s / config.limits.ramp_s, 0.0, 1.0)
     state = changed(state, torch_on=False, stopped_ticks=state.stopped_ticks + 1)
     return _answer(state, share * state.V_stop, config, Diagnostics())

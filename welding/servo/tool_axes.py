@@ -1,5 +1,4 @@
-"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, its path along a seam, and
-the least pipe for it."""
+"""Computes the tool's chord and axes on the seam, its roll rate, its path along a seam, and the least pipe for it."""
 
 import math
 from typing import NamedTuple
@@ -80,8 +79,10 @@ def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
 
 
 class ToolPath(NamedTuple):
-    """The tool along a whole seam, one row a place: arc lengths of torch and tip (n,) m, time (n,) s, and poses of T in
-    B."""
+    """The tool along a whole seam, one row a place.
+
+    Arc lengths of torch and tip (n,) m, time (n,) s, and poses of T in B.
+    """
 
     s_torch: Array
     s_tip: Array
@@ -128,8 +129,9 @@ def _pressed(line: SeamCurve, tip: Array, torch: Array, config: ServoConfig) -> 
 
 
 def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
-    """Check the torch's travel angle along a planned seam, with the pressed tip's rest point deeper in the joint than
-    the torch.
+    """Check the torch's travel angle along a planned seam.
+
+    The pressed tip's rest point is deeper in the joint than the torch.
 
     Raises:
         InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD.
@@ -157,8 +159,9 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
 def check_ring(
     mesh: TriMesh, line: Array, up: Array, section: JointSection, tool: WeldingTool, lean_rad: float = 0.0
 ) -> None:
-    """Check that a tool fits along a root (N,3) m of a joint with directions up (N,3) out of it, and that its torch can
-    follow.
+    """Check that a tool fits along a root (N,3) m of a joint, and that its torch can follow.
+
+    The directions up (N,3) point out of the joint.
 
     Raises:
         NoClearance: its body would touch the part.

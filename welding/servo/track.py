@@ -27,8 +27,10 @@ _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame
 
 
 class TorchTarget(NamedTuple):
-    """The torch's target: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m;
-    `bend`: of the path to the left, 1/m; `rate`: its wanted speed to the left, m/s."""
+    """The torch's target: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m.
+
+    `bend`: of the path to the left, 1/m; `rate`: its wanted speed to the left, m/s.
+    """
 
     point: Array
     tangent: Array

@@ -2,19 +2,84 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.doctor.case import case_text, read_case
+from weldcal.calibration.doctor.case import DoctorCase, case_text, read_case
 from weldcal.calibration.doctor.diagnose import diagnose
+from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.models.arms.chain import chain_poses
 from weldcal.models.errors import InputError
 from weldcal.tools.report.doctor import CHECKED, worded
-from weldcal.tools.worlds.doctor import CAUSES, UNKNOWN, clean
+from weldcal.tools.worlds.doctor import CAUSES, clean, make_world, observe, true_poses
 
 SEED = 31
+
+
+def _inverted(seed: int) -> DoctorCase:
+    case = clean(seed)
+    return case.with_poses(inverse(case.X_BF))
+
+
+def _euler(seed: int) -> DoctorCase:
+    case = clean(seed)
+    angles = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_euler("ZYX")
+    return case.with_poses(pose(Rotation.from_euler("xyz", angles).as_matrix(), case.X_BF[:, :3, 3]))
+
+
+def _shifted(seed: int) -> DoctorCase:
+    case = clean(seed)
+    return case.pick(np.arange(1, case.n)).with_poses(case.X_BF[:-1])
+
+
+def _mirrored(seed: int) -> DoctorCase:
+    case = clean(seed)
+    flip = np.array([1.0, -1.0, 1.0])
+    return replace(case, c=case.c * flip, m=case.m * flip)
+
+
+def _scale(seed: int) -> DoctorCase:
+    case = clean(seed)
+    return replace(case, c=case.c * (1.03 if seed % 2 else 0.97))
+
+
+def _encoder(seed: int) -> DoctorCase:
+    world = make_world(seed)
+    q = world.q.copy()
+    q[:, 1 + seed % 4] += np.radians(2.5)
+    return observe(world, true_poses(world), believed=chain_poses(world.believed, q))
+
+
+def _shuffled(seed: int) -> DoctorCase:
+    case = clean(seed)
+    return case.with_poses(case.X_BF[np.random.default_rng([seed, 11]).permutation(case.n)])
+
+
+def _random_turns(seed: int) -> DoctorCase:
+    case = clean(seed)
+    R = Rotation.random(case.n, random_state=seed).as_matrix()
+    return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
+
+
+UNKNOWN: dict[str, Callable[[int], DoctorCase]] = {
+    "poses inverted": _inverted,
+    "wrong rotation convention": _euler,
+    "scans and poses shifted by one": _shifted,
+    "scanner axes mirrored": _mirrored,
+    "scanner scale error": _scale,
+    "joint zero off by 2.5 degrees": _encoder,
+    "scans of other poses": _shuffled,
+    "rotations without meaning": _random_turns,
+}
+"""What each does to a set, by seed.
+
+Of the last three no model has the name: "unexplained", or a kinematics file, is right.
+"""
 
 
 @pytest.mark.parametrize("cause", CAUSES)

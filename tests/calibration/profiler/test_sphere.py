@@ -124,13 +124,13 @@ def test_the_arms_errors_move_the_flange_as_their_derivatives_say() -> None:
     q = trial.data.q
     assert q is not None
     values = 1e-3 * np.random.default_rng(9).standard_normal(ARM_ERRORS)
-    loads, point, h = world.nominal.loads(q), np.array([0.1, -0.2, 0.3]), 1e-6
+    loads, point, h = world.cell.arm.loads(q), np.array([0.1, -0.2, 0.3]), 1e-6
 
     def at(v: np.ndarray) -> np.ndarray:
-        X = world.nominal.with_errors(q, ProfilerArmErrors.of(v), loads)
+        X = world.cell.arm.with_errors(q, ProfilerArmErrors.of(v), loads)
         return X.rotation @ point + X.translation
 
-    w, v = world.nominal.twists(q, ProfilerArmErrors.of(values), loads)
+    w, v = world.cell.arm.twists(q, ProfilerArmErrors.of(values), loads)
     for k in range(ARM_ERRORS):
         step = h * np.eye(ARM_ERRORS)[k]
         found = (at(values + step) - at(values - step)) / (2.0 * h)
@@ -144,7 +144,7 @@ def test_touches_of_one_spot_or_one_circle_leave_the_centre_open() -> None:
     turn = np.linspace(0.0, 2.0 * np.pi, 20)
     for lean in (0.0, 0.1, 10.0):  # the top, a ring around it, the equator
         n = np.column_stack([lean * np.cos(turn), lean * np.sin(turn), np.ones(20)])
-        p = world.center + RADIUS_M * n / np.linalg.norm(n, axis=1, keepdims=True)
+        p = world.cell.center + RADIUS_M * n / np.linalg.norm(n, axis=1, keepdims=True)
         p_BF = p - felt.rotation @ world.tip + 4e-5 * np.random.default_rng(10).standard_normal((20, 3))
         with pytest.raises(DegenerateMotion, match="one spot or one circle"):
             fit_touch_sphere(felt.rotation, p_BF, world.tip, RADIUS_M)
@@ -178,7 +178,7 @@ def test_one_axis_of_turning_leaves_a_translation_open_for_the_joint_method() ->
         ]
     )
     p_S = np.column_stack([np.zeros(20), np.linspace(-0.012, 0.012, 20), np.full(20, 0.21)])
-    t = world.center - np.einsum("nij,nj->ni", R, p_S @ world.rotation.T + world.translation)
+    t = world.cell.center - np.einsum("nij,nj->ni", R, p_S @ world.rotation.T + world.translation)
     r = np.sqrt(RADIUS_M**2 - p_S[:, 1] ** 2)
     a = np.linspace(-1.0, 1.0, 40)
     profiles = [np.column_stack([q * np.sin(a), 0.21 - q * np.cos(a)]) for q in r]

@@ -54,7 +54,7 @@ def test_the_root_runs_on_a_cylinder_of_its_own_depth(pair: tuple[Workpiece, Wor
 
 def test_the_tips_line_is_that_far_above_the_root_along_the_surfaces_normal(pair: tuple[Workpiece, Workpiece]) -> None:
     _, bent = pair
-    gap = bent.tip_line_P(0.0025) - bent.seam_P
+    gap = bent.tip_height(0.0025) * bent.up_P
     assert np.linalg.norm(gap, axis=1) == pytest.approx(bent.tip_height(0.0025), abs=1e-12)
     assert np.sum(gap * bent.tangents_P, axis=1) == pytest.approx(0.0, abs=1e-12)
 

@@ -93,7 +93,7 @@ def test_drawn_seams_have_the_lengths_and_turns_they_are_known_by() -> None:
 @pytest.mark.parametrize("w", VARIANTS, ids=NAMES)
 def test_a_ball_at_the_seated_height_touches_both_walls(w: Workpiece) -> None:
     radius = 0.0025
-    line = w.tip_line_P(radius)[20:-20:3]
+    line = (w.seam_P + w.tip_height(radius) * w.up_P)[20:-20:3]
     assert line[0, 2] == pytest.approx(-w.depth_m + radius / math.sin(math.radians(22.5)), abs=1e-12)
     # Walls are chords of 1 mm: at the tightest wall (20 mm less half a groove) they lie 8 um off the true surface.
     np.testing.assert_allclose(_distance(w, line), radius, atol=1e-5)
@@ -166,7 +166,7 @@ def test_drake_feels_both_walls_of_the_groove() -> None:
     radius = 0.0025
     sink = 1e-4
     k = len(w.seam_P) // 2
-    center = w.tip_line_P(radius)[k] - [0.0, 0.0, sink]
+    center = (w.seam_P + w.tip_height(radius) * w.up_P)[k] - [0.0, 0.0, sink]
     graph = SceneGraph()
     source = graph.RegisterSource("test")
     rigid, soft = ProximityProperties(), ProximityProperties()

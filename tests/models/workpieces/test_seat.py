@@ -57,7 +57,7 @@ def test_a_hard_ball_rests_where_its_energy_is_least(name: str) -> None:
 def test_in_a_v_groove_it_is_the_closed_form() -> None:
     tool = replace(TOOL, groove_half_angle_rad=JOINTS["v"].half_angle_rad)
     seated = seat(JOINTS["v"], tool, Press(tool.press_axial_m, tool.press_lateral_m))
-    assert seated.aside_m == pytest.approx(tool.seat_side_m, abs=1e-9)
+    assert seated.aside_m == pytest.approx(tool.seat.aside_m, abs=1e-9)
     assert seated.above_m == pytest.approx(hard_height(JOINTS["v"], R) - tool.seat_sink_m, abs=1e-9)
 
 

@@ -33,7 +33,10 @@ class Groove:
         assert truth.X_BP is not None
         R = truth.X_BP.rotation().matrix()
         k = int(np.searchsorted(truth.workpiece.arc_length_m, START_S))
-        self.p_BSeat = truth.X_BP @ truth.workpiece.tip_line_P(TOOL.tip_radius_m)[k]
+        self.p_BSeat = (
+            truth.X_BP
+            @ (truth.workpiece.seam_P + truth.workpiece.tip_height(TOOL.tip_radius_m) * truth.workpiece.up_P)[k]
+        )
         self.tangent, self.up = R @ truth.workpiece.tangents_P[k], R[:, 2]
         self.left = np.cross(self.up, self.tangent)
         self.X_BT_axes = RotationMatrix(np.column_stack([self.tangent, self.left, self.up]))
@@ -118,7 +121,7 @@ def test_it_sits_where_its_stiffness_and_its_press_say(sliding: tuple[np.ndarray
     assert deflection[1:] == pytest.approx([-LATERAL_M, AXIAL_M], abs=0.03e-3)
     # A polyhedron of 128 tetrahedra is not quite as deep everywhere as the ball it stands for.
     assert -place[2] == pytest.approx(TOOL.seat_sink_m, abs=0.03e-3)
-    assert place[1] == pytest.approx(TOOL.seat_side_m, abs=0.01e-3)
+    assert place[1] == pytest.approx(TOOL.seat.aside_m, abs=0.01e-3)
 
 
 def test_the_contact_models_ball_is_as_large_as_the_tip() -> None:
@@ -167,4 +170,4 @@ def test_as_the_finger_camera_feels_it_the_tip_sits_where_the_tools_numbers_say(
         points.append(groove.local(X_BT @ (deflection - free)))
     # The tip itself is that near to the tool's numbers (above); the tag adds a hundredth (test_finger_camera.py).
     assert -np.mean(points, axis=0)[2] == pytest.approx(TOOL.seat_sink_m, abs=0.04e-3)
-    assert np.mean(points, axis=0)[1] == pytest.approx(TOOL.seat_side_m, abs=0.015e-3)
+    assert np.mean(points, axis=0)[1] == pytest.approx(TOOL.seat.aside_m, abs=0.015e-3)

@@ -40,10 +40,8 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
             covariance=np.eye(6) * 1e-8,
             rms_m=1e-4,
             agreement=1.0,
-            violation=0.0,
             seen=1.0,
             confidence=1.0,
-            runner_up=0.0,
             summary="high confidence",
         )
         return said, type("Joint", (), {"seam": part.seam, "share": 1.0})

@@ -109,12 +109,10 @@ def test_a_pose_out_of_range_or_far_from_the_corners_is_refused() -> None:
     assert seen.reprojection_px > 1.0
 
 
-def test_deflection_is_turned_into_the_tip_frame_and_divided_by_the_gain() -> None:
+def test_deflection_is_turned_into_the_tip_frame() -> None:
     rest, now = RigidTransform([0.0, 0.0, 0.04]), RigidTransform([0.001, 0.002, 0.043])
     R_TK = RotationMatrix(RollPitchYaw(np.pi, 0.0, 0.0))  # the camera looks down from above the tip
-    np.testing.assert_allclose(deflection_from_tag(now, rest, R_TK, 0.8), [0.00125, -0.0025, -0.00375], atol=1e-12)
-    with pytest.raises(TagError):
-        deflection_from_tag(now, rest, R_TK, 0.0)
+    np.testing.assert_allclose(deflection_from_tag(now, rest, R_TK), [0.001, -0.002, -0.003], atol=1e-12)
 
 
 def test_what_is_no_tag_image_or_camera_is_named() -> None:

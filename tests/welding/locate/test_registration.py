@@ -99,7 +99,6 @@ def test_a_plate_with_a_displaced_groove_is_found_by_its_datums(shape: str, seed
     assert found.confidence > 0.9
     # 0.1 mm at 650 mm grows with the square of the distance to 0.2 mm at 0.93 m.
     assert 0.1e-3 < found.rms_m < 0.3e-3
-    assert found.inlier_fraction > 0.9
 
 
 def test_edges_exactly_along_the_pixel_rows_are_the_worst_case_and_still_within_the_limit() -> None:

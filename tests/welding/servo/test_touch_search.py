@@ -14,10 +14,12 @@ from weldcal.tools.worlds.weld.budgets import NOMINAL, Unknowns
 from weldcal.tools.worlds.weld.case import RunMetrics, judge
 from weldcal.tools.worlds.weld.groove import TipPlace, Wedge
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
-from weldcal.welding.numerics import Array
+from weldcal.welding.numerics import Array, changed
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.plan_fit import PlanFit
+from weldcal.welding.servo.faults import raised
 from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchOnConfig
-from weldcal.welding.servo.state import WeldingState
+from weldcal.welding.servo.state import Measurement, Phase, WeldingState
 from weldcal.welding.servo.touch import _search
 
 CONFIG = ServoConfig()
@@ -52,6 +54,56 @@ def test_a_ball_far_above_its_plan_or_beside_a_narrow_joint_is_at_a_wall() -> No
 @pytest.mark.parametrize("offset_m", [0.0, -5e-3])
 def test_a_ball_that_rests_where_it_is_planned_is_seated_at_once(offset_m: float) -> None:
     assert searched(offset_m, 1e-4)[1:] == (True, 3)
+
+
+def seated_at(lean: float, heights_m: Array) -> bool:
+    """Whether a ball of a guiding joint is seated within frames in which it leans so, over what is wanted."""
+    config = replace(CONFIG, touch=replace(CONFIG.touch, offset_m=0.0))
+    state = changed(REST, delta_n=lean * CONFIG.deflection.delta_d_m)
+    state = replace(state, touch=replace(state.touch, step="search", face_height=2e-3, start_left=0.0))
+    for frame, height in enumerate(heights_m):
+        state, _, _, problem, seated = _search(state, True, 0.0, float(height), 0.0, 1.0, config, 0.03 * frame)
+        if problem or seated:
+            return seated
+    return False
+
+
+SLIDING_LEAN = 1.0 + 1.0 / 6.0  # least lean of a ball that slides: friction 0.2, up to 120 deg
+
+
+@pytest.mark.parametrize(("lean", "seated"), [(1.1, True), (SLIDING_LEAN, False), (1.4, False)])
+def test_a_ball_that_leans_as_one_that_slides_is_not_seated(lean: float, seated: bool) -> None:
+    assert seated_at(lean, np.full(20, 2e-3)) == seated
+
+
+@pytest.mark.parametrize(("step_mm", "seated"), [(0.2, True), (0.4, False)])
+def test_a_ball_whose_height_changes_is_not_seated(step_mm: float, seated: bool) -> None:
+    """The tag's noise of 0.05 mm makes four sigma of a change; a slide makes more."""
+    assert seated_at(1.0, np.tile([2e-3, 2e-3 + 1e-3 * step_mm], 10)) == seated
+
+
+def held_after(falls_m: Array) -> int | None:
+    """The frame in which a ball that was seated 2 mm above its plan, and then falls so far, is held; None for none."""
+    plan = SeamCurve.from_points(arcs((0.12, 0.0)), np.array([0.0, 0.0, 1.0]))
+    state = changed(REST, plan_fit=PlanFit.start(plan), s_tip=0.05, phase=Phase.TRACK)
+    state = changed(state, touch=replace(REST.touch, raised_m=2e-3))
+    for frame, fall in enumerate(falls_m):
+        point = np.array([0.05, 0.0, 2e-3 - float(fall)])
+        state = raised(changed(state, measurement=Measurement(0.03 * frame, point, np.zeros(3), point)), CONFIG)
+        if state.phase == Phase.FAULT:
+            return frame
+    return None
+
+
+@pytest.mark.parametrize(("fall_mm", "held"), [(0.4, None), (0.7, 0)])
+def test_a_ball_that_falls_by_half_of_a_low_tack_is_held(fall_mm: float, held: int | None) -> None:
+    assert held_after(np.array([1e-3 * fall_mm])) == held
+
+
+@pytest.mark.parametrize(("fall_mm", "held"), [(0.018, False), (0.03, True)])
+def test_a_ball_follows_the_slope_of_a_plan_and_no_steeper_one(fall_mm: float, held: bool) -> None:
+    """By frame: at 8 mm/s and 30 frames a second 0.018 mm are a slope of 7 %, and 0.03 mm one of 11 %."""
+    assert (held_after(1e-3 * fall_mm * np.arange(1.0, 101.0)) is not None) == held
 
 
 R, SEAT, D = 2.5e-3, 2.5e-3 * math.sqrt(2.0), math.sqrt(0.5)

@@ -43,8 +43,9 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 
 @dataclass(frozen=True, kw_only=True)
 class PartTrial:
-    """How the parts lie and are found: deviations of the true part, and the source of its pose; and what is known of
-    the arm.
+    """How the parts lie and are found: deviations of the true part, and the source of its pose.
+
+    And what is known of the arm.
 
     `arm_mm`: rms distance of the true flange from the reported one. `refine`: as calibration.refine; with any but none
     the cell is calibrated before it welds, else it is given the scanner's pose.
@@ -67,16 +68,10 @@ class PartTrial:
         """
         if refine not in REFINEMENTS:
             raise InputError(f"--refine must be {', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}, not '{refine}'.")
-        if located_by == "drawing":
-            return cls(
-                located_by=located_by,
-                translation_mm=1.0,
-                rotation_deg=0.3,
-                seam_mm=seam_mm,
-                refine=refine,
-                arm_mm=arm_mm,
-            )
-        return cls(located_by=located_by, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm)
+        mm, deg = (1.0, 0.3) if located_by == "drawing" else (cls.translation_mm, cls.rotation_deg)
+        return cls(
+            located_by=located_by, translation_mm=mm, rotation_deg=deg, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm
+        )
 
     def calibration(self) -> Mapping[str, object]:
         """The keys of the scenario's calibration, besides the guess of the mounting."""

@@ -59,13 +59,30 @@ def looking_at(eye: Floats, target: Floats) -> RigidTransform:
     return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), eye)
 
 
-def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spread_m: float = 0.06) -> RigidTransform:
-    """X_BP of a part wedged up on the table: any turn, a tilt up to `tilt_rad` in any direction, its underside free."""
+def wedged(rng: np.random.Generator, tilt_rad: float) -> RotationMatrix:
+    """R_BP of a part at any turn, wedged up by a tilt of at most `tilt_rad` in any direction."""
     heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
     axis = tilt * np.array([math.cos(heading), math.sin(heading)])
-    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
-        rng.uniform(-math.pi, math.pi)
+    turn = RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
+    return RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ turn
+
+
+def hung(
+    rng: np.random.Generator, target: Floats, slant_rad: float, far_m: Callable[[], float], turn_rad: float
+) -> RigidTransform:
+    """X_BC of a scanner roughly above `target` (3,), up to `slant_rad` off the vertical and turned by `turn_rad`."""
+    around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
+    aside = math.sin(slant)
+    X = looking_at(
+        target + far_m() * np.array([aside * math.cos(around), aside * math.sin(around), math.cos(slant)]), target
     )
+    turn = RotationMatrix.MakeZRotation(rng.uniform(-turn_rad, turn_rad))
+    return RigidTransform(X.rotation() @ turn, X.translation())
+
+
+def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spread_m: float = 0.06) -> RigidTransform:
+    """X_BP of a part wedged up on the table: any turn, a tilt up to `tilt_rad` in any direction, its underside free."""
+    R = wedged(rng, tilt_rad)
     lift = -float((part.mesh.vertices @ R.matrix().T)[:, 2].min()) + 0.0005
     x, y = np.array([0.6, 0.0]) + rng.uniform(-spread_m, spread_m, size=2)
     return RigidTransform(R, [x, y, lift])
@@ -87,15 +104,9 @@ def scan_part(
     rng = np.random.default_rng([seed, 41])
     X = random_pose(rng, part, tilt_rad, spread_m)
     far = min(0.93, 0.97 * scanner.far_m)
-    around, slant = rng.uniform(-math.pi, math.pi), SLANT_RAD * math.sqrt(rng.uniform())
-    target = np.array([0.6, 0.0, 0.02])
-    eye = target + far * np.array(
-        [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]
-    )
-    X_BC = looking_at(eye, target)
-    X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.3, 0.3)), eye)
+    X_BC = hung(rng, np.array([0.6, 0.0, 0.02]), SLANT_RAD, lambda: far, 0.3)
     cloud = cast([part.mesh.transformed(X), table(), *others], X_BC, scanner, seed)
-    return Scene(cloud, eye, X, part)
+    return Scene(cloud, np.asarray(X_BC.translation()), X, part)
 
 
 def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[Floats, Floats]:
@@ -127,8 +138,10 @@ def part_for(preset: str, shape: str) -> Workpiece:
 
 
 def scan(preset: str, shape: str, seed: int, widest_px: int | None = WIDEST_PX) -> Scene:
-    """A part under that preset, at most `widest_px` wide (None: as the scanner has it), in a random pose tilted by up
-    to 5 deg."""
+    """Scan a part with that preset, in a random pose tilted by up to 5 deg.
+
+    The image is at most `widest_px` wide (None: as the scanner has it).
+    """
     scanner = get_scanner(preset)
     scanner = scanner.resized(widest_px) if widest_px is not None and scanner.width > widest_px else scanner
     part = part_for(preset, shape)
@@ -165,8 +178,9 @@ PLANNED, REFUSED = "planned", "refused"
 
 @dataclass(frozen=True)
 class Trouble:
-    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what
-    the answer has to be, empty where a plan with an honest sigma and a refusal are both right.
+    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself.
+
+    `must`: what the answer has to be, empty where a plan with an honest sigma and a refusal are both right.
     """
 
     name: str
@@ -249,11 +263,7 @@ def standing(
     mesh: TriMesh, rng: np.random.Generator, tilt_rad: float, lift_m: float, spread_m: float
 ) -> RigidTransform:
     """X_BP of a part as it is drawn (its z up), at any turn, wedged up by a tilt in any direction."""
-    heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
-    axis = tilt * np.array([math.cos(heading), math.sin(heading)])
-    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
-        rng.uniform(-math.pi, math.pi)
-    )
+    R = wedged(rng, tilt_rad)
     turned = mesh.vertices @ R.matrix().T
     middle = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
     at = MIDDLE[:2] + rng.uniform(-spread_m, spread_m, size=2) - middle[:2]
@@ -296,8 +306,10 @@ def without_spots(cloud_B: Floats, mesh_B: TriMesh, rng: np.random.Generator, co
 
 
 def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
-    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its
-    bounds."""
+    """Boxes, pipes and a fixture's clamps beside the part, none through it.
+
+    Each drawn anew until it is clear of its bounds.
+    """
     low, high = mesh_B.bounds
     found: list[TriMesh] = []
     for _ in range(200):
@@ -306,8 +318,6 @@ def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMe
         size = rng.uniform([0.02, 0.02, 0.005], [0.12, 0.08, 0.09])
         one = box(*size)
         if rng.uniform() < 0.35:
-            from weldcal.models.mesh import revolve
-
             r, h = rng.uniform(0.012, 0.045), rng.uniform(0.02, 0.12)
             one = revolve(np.array([[0.0, 0.0], [r, 0.0], [r, h], [0.0, h]]), 48)
         X = RigidTransform(
@@ -371,20 +381,13 @@ def scan_scene(
         middle = 0.5 * np.sum(mesh.transformed(X).bounds, axis=0) - MIDDLE
         X = RigidTransform(X.rotation(), X.translation() - [middle[0], middle[1], 0.0])
     mesh_B = mesh.transformed(X)
-    around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
-    target = MIDDLE + np.array([0.0, 0.0, 0.02])
-    far = rng.uniform(0.78, 0.95)
-    eye = target + far * np.array(
-        [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]
-    )
-    X_BC = looking_at(eye, target)
-    X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.5, 0.5)), eye)
+    X_BC = hung(rng, MIDDLE + np.array([0.0, 0.0, 0.02]), slant_rad, lambda: rng.uniform(0.78, 0.95), 0.5)
     others = clutter(mesh_B, rng, objects) + clamps(mesh_B, rng, fingers) + (vice(mesh_B) if in_vice else [])
     if twice:
         wide = mesh_B.bounds[1, 0] - mesh_B.bounds[0, 0] + 0.02
         others.append(mesh_B.transformed(RigidTransform([-wide if MIDDLE[0] < X.translation()[0] else wide, 0.0, 0.0])))
     cloud = cast([mesh_B, table(), *others], X_BC, scanner, seed)
-    return PartScene(without_spots(cloud, mesh_B, rng, spots) if spots else cloud, eye, X)
+    return PartScene(without_spots(cloud, mesh_B, rng, spots) if spots else cloud, np.asarray(X_BC.translation()), X)
 
 
 def block() -> TriMesh:

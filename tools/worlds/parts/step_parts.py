@@ -19,8 +19,10 @@ Corners = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MadePart:
-    """A part in mm: its shape, its joint, points (N,3) on the seam's root in the order of travel, roughly (up to 0.3
-    mm), and the exact length of the root.
+    """Hold a part in mm with the seam on it.
+
+    Its shape, its joint, points (N,3) on the seam's root in the order of travel, roughly (up to 0.3 mm), and the exact
+    length of the root.
 
     `up` (3,): out of the joint, for a line that needs it; `concave`: how many concave edges the file has.
     """

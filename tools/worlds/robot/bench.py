@@ -107,7 +107,7 @@ class CommandThread(threading.Thread):
     @property
     def cruising(self) -> bool:
         """The arm goes at full speed and will for a while."""
-        going = self.state.fault is Fault.NONE and self.state.sent > 25 and self.state.process_on == self.process
+        going = self.state.fault is Fault.NONE and self.state.number > 25 and self.state.process_on == self.process
         return going and self._stroke.cruising and float(np.abs(self.state.qd).max()) > 0.05
 
 
@@ -170,8 +170,10 @@ class Bench:
         self._stream.start()
 
     def start_elsewhere(self) -> list[int]:
-        """As `start`, with link and commands in a process of their own, which can be killed; that process's
-        children."""
+        """As `start`, with link and commands in a process of their own, which can be killed.
+
+        That process's children.
+        """
         self.emulator.do("reset_checker")
         command = [sys.executable, "-m", "weldcal.tools.worlds.robot.bench", self.host, self.transport]
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -272,8 +274,10 @@ class Bench:
 
 
 def main() -> None:
-    """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed; answers each
-    line when it cruises, or why it does not."""
+    """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed.
+
+    Answers each line when it cruises, or why it does not.
+    """
     host, transport = sys.argv[1:]
     arm, config = load_arm(), UrRtde(host=host)
     load = tuple(config.payload_cog_m)

@@ -322,8 +322,9 @@ def _throw(bench: Bench, rng: np.random.Generator, done: FaultSequence, cases: l
 
 
 def _injected(bench: Bench, done: FaultSequence, case: FaultCase) -> bool:
-    """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken
-    the power.
+    """Inject it; False where the robot is not ready for it.
+
+    No program starts, for one, where a fault has just taken the power.
 
     Raises:
         WeldcalError: the robot was ready, and the fault could not be injected.

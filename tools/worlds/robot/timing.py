@@ -39,7 +39,7 @@ class Tap:
     motions: array[float] = field(default_factory=lambda: array("d"))
     state_now: LinkState | None = None
     starts: list[int] = field(default_factory=lambda: [0])  # how many commands had been sent when a link began
-    _heard: int = -1
+    _heard: float = -1.0
     _wanted: float = 0.0
     _stepped: tuple[float, float, float] | None = None  # when, from, to
 
@@ -64,10 +64,10 @@ class Tap:
         if not self.command_times:
             return found
         self.ages.append(found.age_s)
-        if found.heard != self._heard:
+        if found.echo != self._heard:
             if self._heard >= 0:  # a link's first state may know of no command yet
-                self.echoes.append(found.echo_latency_s)
-            self._heard = found.heard
+                self.echoes.append(found.echo_latency)
+            self._heard = found.echo
         if self._stepped is not None:
             when, before, after = self._stepped
             if (found.qd[STEP_JOINT] - before) / (after - before) > 0.5:
@@ -107,13 +107,17 @@ class HostLateness:
         )
 
     def caused(self, jobs: Sequence[Lateness]) -> int:
-        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in
-        time either."""
+        """Count the velocities of these jobs that were over 8 ms late by this computer's own doing.
+
+        The program above all others was not woken up in time either.
+        """
         return sum(job.shared_with(self.lateness, 8.0) for job in jobs)
 
     def judged(self, jobs: Sequence[Lateness]) -> str:
-        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the
-        cause."""
+        """State how many velocities of these jobs were over 8 ms late.
+
+        And for how many this computer itself was the cause.
+        """
         late, all_of = sum(job.over(8.0) for job in jobs), sum(sum(job.counts) for job in jobs)
         return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 

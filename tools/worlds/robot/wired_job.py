@@ -60,8 +60,9 @@ class Happening:
 
     @property
     def silent(self) -> bool:
-        """Whether no signal of the device differs from that of a sound one until the job ends, so that the job must be
-        done, and right.
+        """Tell whether no signal of the device differs from that of a sound one until the job ends.
+
+        The job must then be done, and right.
 
         A scanner that is not asked says nothing, and nothing is asked of it after the scan of the workpiece; only its
         connection can end. The inputs of a power source whose torch is never lit are off whether their wires are cut,

@@ -211,8 +211,10 @@ def planned_seam(seam: TrueSeam, budget: Budget, rng: np.random.Generator) -> Se
 
 
 def roughness(length: float, budget: Budget, rng: np.random.Generator, spacing: float = 0.25e-3) -> Array:
-    """Sideways roughness (N,) m of the wall every `spacing` m: Gaussian, of the budget's sigma and correlation
-    length."""
+    """Sideways roughness (N,) m of the wall every `spacing` m.
+
+    Gaussian, of the budget's sigma and correlation length.
+    """
     n = max(4, int(length / spacing) + 2)
     if budget.roughness_m == 0.0:
         return np.zeros(n)

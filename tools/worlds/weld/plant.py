@@ -54,8 +54,10 @@ class Stamps:
         return stamp
 
     def picture(self, taken: DeflectionSample) -> DeflectionSample:
-        """The picture with its stamp, and with the pose that the poses' stamps give for that time; `pose` comes
-        first."""
+        """The picture with its stamp, and with the pose that the poses' stamps give for that time.
+
+        `pose` comes first.
+        """
         if self._exact:
             return taken
         stamp = taken.capture_time + self._world.image_bias_s + self._world.image_jitter_s * float(self._rng.normal())
@@ -100,8 +102,10 @@ class StudyRun:
         return np.asarray(self.table[:, COLUMNS.index(name)])
 
     def points(self, name: str) -> Array:
-        """Points (N,3) m of "torch", "robot" or "tip", the velocity "v", or the tool's axes "ahead" (x_T) and "left"
-        (y_T)."""
+        """Select points (N,3) m of "torch", "robot" or "tip", the velocity "v", or an axis of the tool.
+
+        The axes are "ahead" (x_T) and "left" (y_T).
+        """
         first = COLUMNS.index(f"{name}_x")
         return np.asarray(self.table[:, first : first + 3])
 
@@ -206,8 +210,10 @@ def simulate(
 
 
 def _lost(line: SeamCurve, p: Array, s_near: float) -> bool:
-    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included; at s_near m it is probably
-    not."""
+    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included.
+
+    At s_near m it is probably not.
+    """
     if norm(p - line.frame(s_near).position) <= 0.060:
         return False
     return float(np.linalg.norm(p - line.position(line.project(p)))) > 0.060

@@ -26,8 +26,10 @@ class TrueSeam:
 
 
 def arcs(*pieces: tuple[float, float], spacing: float = 1e-3) -> Array:
-    """Points (N,3) m of a plane curve of (length m, curvature 1/m) pieces, from the origin along x; left is
-    positive."""
+    """Points (N,3) m of a plane curve of (length m, curvature 1/m) pieces, from the origin along x.
+
+    Left is positive.
+    """
     points, heading, p = [np.zeros(3)], 0.0, np.zeros(3)
     for length, curvature in pieces:
         n = max(4, round(length / spacing))

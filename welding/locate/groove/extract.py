@@ -1,5 +1,4 @@
-"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on faces bent over a
-cylinder.
+"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on bent ones.
 
 Openings in faces are found coarsely (search); slices across them are fitted with a V (section), each slice with points
 of its own; the offsets of the centres are smoothed along the line, the line is moved by them until it converges
@@ -12,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import WeldcalError
 from weldcal.welding.locate.bent_face import LEAST_RADIUS_M, BentFace, find_bent_faces
 from weldcal.welding.locate.groove.measure import measure_groove
 from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
 from weldcal.welding.locate.groove.search import find_grooves
-from weldcal.welding.locate.planes import Floats, thinned
+from weldcal.welding.locate.planes import Floats, finite_points, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger radius sags by 11 mm or less, and counts as flat
@@ -42,11 +41,7 @@ def extract_groove(
         GrooveNotFound, SeveralGrooves, GrooveTooNarrow, GrooveUncertain: in a sentence; InputError: wrong shape.
     """
     config = config or GrooveConfig()
-    points = np.asarray(points_A, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A cloud has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    (points,) = finite_points([points_A])
     if len(points) < 1000:
         raise GrooveNotFound(f"The cloud has only {len(points)} points: move the workpiece into view.")
     bent, points, failures = bent_seams(points, config, start_A)
@@ -84,8 +79,10 @@ def _mm(p: Floats) -> str:
 def bent_seams(
     points: Floats, config: GrooveConfig, start_A: npt.ArrayLike | None
 ) -> tuple[list[GrooveSeam], Floats, list[WeldcalError]]:
-    """Grooves of all bent faces in a cloud (N,3) m, the points outside these faces, and the errors of grooves
-    refused."""
+    """Find the grooves of all bent faces in a cloud (N,3) m.
+
+    Returns the seams, the points outside these faces, and the errors of grooves refused.
+    """
     seams: list[GrooveSeam] = []
     failures: list[WeldcalError] = []
     rng = np.random.default_rng(config.search.seed)
@@ -110,15 +107,16 @@ def bent_seams(
 
 
 def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
-    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame, with the arc lengths of its root
-    there."""
+    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame.
+
+    The arc lengths are those of its root there.
+    """
     root = face.rolled(seam.root)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(root, axis=0), axis=1))])
 
     def along(x: float) -> float:
         return float(np.interp(x, seam.s, s))
 
-    middle = seam.root[len(seam.root) // 2]
     return replace(
         seam,
         curve=SeamCurve.from_points(root, up=face.up(seam.root)),
@@ -130,6 +128,5 @@ def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
         corners=tuple(along(c) for c in seam.corners),
         apexes=face.rolled(seam.apexes.reshape(-1, 3)),
         start=seam.start.replace("the point given", start),
-        X_AF=face.at(float(middle[0]), float(middle[1]), 0.0),
         bend_radius=face.radius_m,
     )

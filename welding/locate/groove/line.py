@@ -1,5 +1,7 @@
-"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their
-radius."""
+"""Lines in the plane of a face.
+
+Arc length and lateral offset of points, smoothing, and sharp corners with their radius.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +61,10 @@ class SmoothLine:
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
     def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
-        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the
-        other."""
+        """Compute the largest curvature of the line's chords outside a gap.
+
+        The turn from one side of the gap to the other counts too.
+        """
         step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
         chords = self.points[step:] - self.points[:-step]
         heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
@@ -100,8 +104,10 @@ class SmoothLine:
         return SmoothLine(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
 
     def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
-        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30
-        mm."""
+        """Compute arc length and offset (s, n) of points (M,2) by the nearest point on the line.
+
+        With a mask of those within 30 mm.
+        """
         nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
         far = nearest == len(self.points)
         nearest = np.where(far, 0, nearest)
@@ -203,9 +209,11 @@ def meeting_point(p: Floats, t: Floats, q: Floats, w: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Corner:
-    """A corner at arc length s m of the whole line, its apex (2,) m, its radius m, and how far to each side of s no
-    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known;
-    wide: it is certainly a bend."""
+    """Describe a corner of the whole line.
+
+    Its arc length s m, its apex (2,) m, its radius m, and how far to each side of s no cross-section has points of its
+    own, m; sigma: of the line sideways at s, m, as far as the radius is not known; wide: it is certainly a bend.
+    """
 
     s: float
     apex: Floats
@@ -216,8 +224,10 @@ class Corner:
 
 
 def split_legs(line: SmoothLine, profile: Profile, wide: list[Floats]) -> tuple[list[SmoothLine], list[Corner]]:
-    """Split the line at its tight turns into straight legs, and return the corners between them; turns near
-    the places (2,) in `wide` are not corners."""
+    """Split the line at its tight turns into straight legs, and return the corners between them.
+
+    Turns near the places (2,) in `wide` are not corners.
+    """
     turns = [
         s for s in tight_turns(line) if all(np.linalg.norm(line.at(np.array([s]))[0][0] - p) > SIDE_M for p in wide)
     ]

@@ -90,8 +90,10 @@ def _traced(
     config: GrooveConfig,
     wide: list[Floats],
 ) -> tuple[SmoothLine, list[Corner], Profile]:
-    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common
-    profile."""
+    """Move the coarse line onto the groove in legs between its corners.
+
+    The joined line, the corners and the common profile.
+    """
     pitch, sigma = groove.pitch_m, groove.sigma_m
     lines: list[SmoothLine] = [line]
     corners: list[Corner] = []
@@ -261,10 +263,8 @@ def _finish(
         closed=groove.closed,
         ends_seen=ends_seen,
         start=word,
-        X_AF=groove.X_AQ,
         pitch=pitch,
         face_sigma=groove.sigma_m,
-        n_sections=len(slices.s),
     )
 
 
@@ -315,8 +315,10 @@ def measured_extent(
 def ends_at_edges(
     f: Floats, ends: tuple[float, float], line: SmoothLine, profile: Profile, reach_m: float
 ) -> tuple[bool, bool]:
-    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the
-    view."""
+    """Tell whether lower ground is seen within `reach_m` beyond each end.
+
+    There the plate ends, and not only the view.
+    """
     half_width = profile.depth / min(profile.slopes)
     tail = line.extended(reach_m + 0.001, reach_m + 0.001)
     s, n, beside = tail.coordinates(f[:, :2])

@@ -1,11 +1,12 @@
-"""Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse
-it."""
+"""Data of a V-groove.
+
+The expected profile, the measured seam with its sigmas, limits, and the errors that refuse it.
+"""
 
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
 from weldcal.welding.locate.groove.search import SearchConfig
@@ -64,8 +65,9 @@ class Profile:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GrooveSeam:
-    """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame
-    A.
+    """A measured V-groove, sampled every millimetre of arc length from its start.
+
+    Metres, radians, in the cloud's frame A.
 
     curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm root,
     left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root depth, angle
@@ -73,7 +75,7 @@ class GrooveSeam:
     sideways and in height gaps                 (from, to) arc lengths that were bridged and not seen; corners, apexes
     arc lengths of tight corners, and (K,3) where the two sides meet there ends_seen            whether first and last
     end lie at the edge of the face, not at the edge of what was seen start                a phrase that says which end
-    is the start X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a
+    is the start bend_radius          of a face bent over a
     cylinder, negative for a hollow one
     """
 
@@ -92,10 +94,8 @@ class GrooveSeam:
     closed: bool
     ends_seen: tuple[bool, bool]
     start: str
-    X_AF: RigidTransform
     pitch: float
     face_sigma: float
-    n_sections: int
     bend_radius: float = math.inf
 
     @property

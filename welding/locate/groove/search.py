@@ -49,8 +49,9 @@ class CoarseGroove:
 
 
 def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroove], float, float]:
-    """Find every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest
-    distance of points on the faces seen, m.
+    """Find every groove-like opening in faces of a cloud (N,3) m whose z is up.
+
+    The largest noise and the widest distance of points on the faces seen, m.
     """
     rng = np.random.default_rng(config.seed)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
@@ -257,8 +258,10 @@ def _joined(
 
 
 def _bridge(a: Floats, b: Floats, level: Mask, cell: float, config: SearchConfig) -> tuple[float, Floats]:
-    """Cost (infinite: they are two) and points of a smooth bridge from the end of one line to the beginning of the
-    other."""
+    """Compute a smooth bridge from the end of one line to the beginning of the other: its cost and its points.
+
+    The cost is infinite where they are two lines.
+    """
     none = (math.inf, np.empty((0, 2)))
     gap = b[0] - a[-1]
     distance = float(np.linalg.norm(gap))

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
-from weldcal.welding.locate.part.fit import contours, into, joined
+from weldcal.welding.locate.part.fit import contours, joined
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.scan import PreparedScan
+from weldcal.welding.locate.planes import into
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

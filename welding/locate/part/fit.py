@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.welding.locate.part.model import PartModel, SharpEdges
 from weldcal.welding.locate.part.scan import PreparedScan, View
+from weldcal.welding.locate.planes import into
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -44,8 +45,10 @@ MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Linearised equations in P: rows (M,6) of rotation and translation, and residuals (M,) m, with weights and
-    clusters (M,)."""
+    """Linearised equations in P.
+
+    Rows (M,6) of rotation and translation, and residuals (M,) m, with weights and clusters (M,).
+    """
 
     rows: Floats
     residual: Floats
@@ -67,11 +70,6 @@ def moved(X: RigidTransform, xi: Floats) -> RigidTransform:
     return X @ RigidTransform(RotationMatrix(Rotation.from_rotvec(xi[:3]).as_matrix()), xi[3:])
 
 
-def into(X_BP: RigidTransform, p_B: Floats) -> Floats:
-    """Points (N,3) of the base in P."""
-    return np.asarray((p_B - X_BP.translation()) @ X_BP.rotation().matrix())
-
-
 def _within(p: Floats, middle: Floats, reach: float) -> Mask:
     """Which points (N,3) lie nearer than `reach` to a point (3,)."""
     d = p - middle
@@ -79,8 +77,10 @@ def _within(p: Floats, middle: Floats, reach: float) -> Mask:
 
 
 def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: float = SAME_SIDE_COS) -> Equations:
-    """Point-to-plane equations of the points p (N,3) in P with normals n (N,3) that lie within `gate` of the
-    surface."""
+    """Set up the point-to-plane equations of points p (N,3) in P with normals n (N,3).
+
+    Only of those that lie within `gate` of the surface.
+    """
     near = _within(p, model.center, model.radius + gate)
     p, n = p[near], n[near]
     q, m = model.closest(p) if len(p) else (p, n)
@@ -92,8 +92,10 @@ def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: floa
 
 
 def contour(model: PartModel, eye: Floats) -> SharpEdges:
-    """The samples of sharp edges that, seen from the eye (3,) in P, end a face the scanner measures and hide nothing of
-    it."""
+    """Select the samples of sharp edges that, seen from the eye (3,) in P, end a measured face.
+
+    Those that hide something of the face are left out.
+    """
     e = model.edges
     if not len(e.point):
         return e
@@ -173,8 +175,10 @@ def rim_rows(
 
 
 def _ends_itself(beyond: Floats, normal: Floats, view: View, behind: float, X_BP: RigidTransform) -> Mask:
-    """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something
-    behind the faces and nothing before them."""
+    """Tell whether faces with normals (N,3) end by themselves at points (N,3) of P just beyond their rims.
+
+    The scan then shows something behind the faces there and nothing before them.
+    """
     R = X_BP.rotation().matrix()
     at = beyond @ R.T + X_BP.translation()
     d = at - view.eye
@@ -214,8 +218,9 @@ def _rim_weights(rims: Equations, pitch: float, reach: float) -> Floats:
 def step(
     surface: Equations, rims: Equations | None, c: float, sigma: float, pitch: float, reach: float = 0.0
 ) -> Floats | None:
-    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are
-    near.
+    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it.
+
+    None where too few points are near.
 
     reach: how far off, m, rims still count: where a few of many sides are, they would be taken for others.
     """
@@ -313,8 +318,9 @@ def _patches(equations: Equations, size: float) -> npt.NDArray[np.int64]:
 
 
 def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
-    """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge,
-    share.
+    """Compute the covariance (6,6) of the pose by the sandwich of the normal equations.
+
+    Points of a patch, or of an edge, share errors.
 
     The points of a patch of PATCHES point distances are one cluster, those of a piece of an edge another (Liang and
     Zeger 1986). Added are errors that a patch or a side has in common: CREEP_M in a patch, SLOW_M in one of SHARED_M,

@@ -1,5 +1,6 @@
-"""Measures the joint along the drawn seam in the scan: its two walls in cuts square to the seam, and the root between
-them.
+"""Measures the joint along the drawn seam in the scan.
+
+Its two walls in cuts square to the seam, and the root between them.
 
 The unknowns are the root's shift in the cut and each wall's tilt, at knots along the seam. They follow from the
 distances of the scan's points from the drawn walls; the drawing is a weak prior, and a second difference keeps them
@@ -109,8 +110,10 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """The scan about the seam: points and normals (N,3), the seam's nearest point k (N,), and the offset from it
-    (N,3)."""
+    """The scan about the seam.
+
+    Points and normals (N,3), the seam's nearest point k (N,), and the offset from it (N,3).
+    """
 
     points: Floats
     normals: Floats
@@ -187,8 +190,9 @@ def _gap_rows(cut: _Cut, seam: DrawnSeam, pitch: float) -> Rows | None:
 
 
 def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Knots (K,) m along the seam with the shifts to the left and along the bisector (K,) m, their covariance (K,2,2),
-    and the deviation (K,) by the drawing alone.
+    """Compute the knots (K,) m along the seam and the shifts (K,) m there, to the left and along the bisector.
+
+    With their covariance (K,2,2), and the deviation (K,) by the drawing alone.
     """
     count = max(3, math.ceil(length / KNOT_M) + 1)
     at = np.linspace(0.0, length, count)
@@ -305,8 +309,9 @@ def check_fit_up(found: FitUp, limits: Mapping[str, tuple[float, float]], joint:
 
 
 def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartModel, seam: DrawnSeam) -> FitUp:
-    """Measure gap, misalignment and angle of a joint in windows along its seam; the arguments are those of
-    `measure_joint`.
+    """Measure gap, misalignment and angle of a joint in windows along its seam.
+
+    The arguments are those of `measure_joint`.
 
     On each side a plane is fitted to the points of the wall. The gap is the distance between the places where the two
     sides' points end, and the drawing only says which points are of which side.
@@ -328,8 +333,11 @@ def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartM
 
 
 class _Side(NamedTuple):
-    """A wall in a window: directions along it and out of it (2,), its height over the drawn one and slope with their
-    sigmas (2,), its points (M,3) by left, up and along the seam, and their noise."""
+    """A wall in a window.
+
+    Directions along it and out of it (2,), its height over the drawn one and slope with their sigmas (2,), its points
+    (M,3) by left, up and along the seam, and their noise.
+    """
 
     along: Floats
     out: Floats
@@ -395,8 +403,10 @@ def _fit_up_at(
 
 
 def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
-    """Width m of the gap between level faces, by the widest step across the seam between points (M,3) of both, in
-    strips; and its sigma."""
+    """Compute the width m of the gap between level faces, and its sigma.
+
+    By the widest step across the seam between points (M,3) of both, in strips.
+    """
     widest, usual = [], []
     for x in _strips(rows[:, 0], rows[:, 2]):
         steps = np.diff(x)
@@ -412,15 +422,18 @@ def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
 
 
 def _strips(x: Floats, s: Floats) -> list[Floats]:
-    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once: a point may be of both
-    sides."""
+    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once.
+
+    A point may be of both sides.
+    """
     strip = np.floor(s / STRIP_M)
     return [np.unique(x[strip == k]) for k in np.unique(strip)]
 
 
 def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> tuple[float, float]:
-    """Distance m from the root (2,) along a wall at which its points end, and its sigma; 0 where they reach the other
-    wall.
+    """Distance m from the root (2,) along a wall at which its points end, and its sigma.
+
+    0 where they reach the other wall.
 
     Points nearer to the other wall than `clear` may be of either.
     """
@@ -444,8 +457,9 @@ def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> t
 
 
 def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | None = None) -> tuple[float, float, float]:
-    """How far the sheet on the left of a lap lies above that on the right, m, against the drawing, its sigma, and the
-    tilt of both, or that given.
+    """Compute how far the sheet on the left of a lap lies above that on the right, m, against the drawing.
+
+    With its sigma, and the tilt of both, or that given.
 
     NaN where one of them is not seen.
     """

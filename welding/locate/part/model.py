@@ -103,8 +103,10 @@ class PartModel:
 
     @cached_property
     def directions(self) -> list[Floats]:
-        """Directions (3,) of P that may point up: the part rests on a face of its hull, or a large flat face lies
-        up."""
+        """Directions (3,) of P that may point up.
+
+        The part rests on a face of its hull, or a large flat face lies up.
+        """
         found: list[tuple[float, Floats]] = []
         hull = ConvexHull(self.mesh.vertices)
         corners = self.mesh.vertices[hull.simplices]

@@ -24,10 +24,9 @@ from weldcal.welding.locate.part.rivals import (
     same_set,
     turned_poses,
 )
-from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
+from weldcal.welding.locate.part.scan import PreparedScan, prepare
 from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places, sinks
-
-Floats = npt.NDArray[np.float64]
+from weldcal.welding.locate.planes import Floats, finite_points
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
@@ -221,8 +220,10 @@ def _screened(
 def _fine(
     scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
-    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the
-    search."""
+    """Fit the best starts finely, different ones only, best first.
+
+    After `enough` a good and clean one ends the search.
+    """
     judged: list[_Judged] = []
     for X in starts[:most]:
         known = [j.agreement for j in judged]
@@ -468,10 +469,8 @@ def _result(best: _Judged, runner_up: float, note: str, model: PartModel, matter
         covariance=best.fit.covariance,
         rms_m=best.fit.rms_m,
         agreement=a.met,
-        violation=a.passed,
         seen=a.seen,
         confidence=confidence,
-        runner_up=runner_up,
         summary="",
     )
     at = model.points[::300] if matters_P is None else np.asarray(matters_P)

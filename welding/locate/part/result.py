@@ -58,21 +58,20 @@ class PartConfig:
 class PartRegistration:
     """The pose X_BP of a part, and how well the scan agrees with it.
 
-    covariance   (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation (rad) then translation
-    (m) rms_m        rms distance of the scan's points from the part's surface, m agreement    share of the rays
-    predicted to meet the part that do; violation: share that pass through it seen         share of the part's surface
-    facing the scanner that the scan shows confidence   0 to 1: agreement less violation, reduced by the runner-up
-    runner_up    score of the best other pose over that of this one, 0 to 1 summary      the result in one sentence
+    covariance   (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation (rad), translation (m)
+    rms_m        rms distance of the scan's points from the part's surface, m
+    agreement    share of the rays predicted to meet the part that do
+    seen         share of the part's surface facing the scanner that the scan shows
+    confidence   0 to 1: agreement less the share that pass through it, reduced by the best other pose
+    summary      the result in one sentence
     """
 
     X_BP: RigidTransform
     covariance: Floats
     rms_m: float
     agreement: float
-    violation: float
     seen: float
     confidence: float
-    runner_up: float
     summary: str
 
     def spread_at(self, points_P: Floats) -> Floats:

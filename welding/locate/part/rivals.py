@@ -51,8 +51,10 @@ def own_axes(model: PartModel) -> list[Floats]:
 
 
 def same_set(points_P: Floats | None, X_PP: RigidTransform) -> bool:
-    """Whether a motion in P leaves these points (N,3), as a set, where they are, to 0.6 mm (the spacing is allowed
-    for)."""
+    """Tell whether a motion in P leaves these points (N,3), as a set, where they are, to 0.6 mm.
+
+    The spacing is allowed for.
+    """
     if points_P is None or len(points_P) < 2:
         return False
     there = np.asarray(points_P) @ X_PP.rotation().matrix().T + X_PP.translation()
@@ -91,8 +93,7 @@ def axis_name(direction: Floats, whose: str) -> str:
 
 
 def free_directions(model: PartModel, X_BP: RigidTransform, covariance: Floats, limit_m: float) -> list[FreeDirection]:
-    """The independent motions by whose standard deviation a point of the part moves more than `limit_m`, worst
-    first."""
+    """List the independent motions by whose sigma a point of the part moves more than `limit_m`, worst first."""
     c, length = model.points.mean(axis=0), 0.5 * model.radius
     cross = np.array([[0.0, -c[2], c[1]], [c[2], 0.0, -c[0]], [-c[1], c[0], 0.0]])
     # Motion of the middle and rotation times the part's size: both are lengths then.

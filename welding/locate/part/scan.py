@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -94,22 +93,6 @@ class PreparedScan:
     def eyes(self) -> Floats:
         """The scanners' positions (V,3)."""
         return np.array([v.eye for v in self.views])
-
-
-def finite_points(points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]]) -> list[Floats]:
-    """Select the measured points (N,3) of each scan, (N,3) or (H,W,3), of a list or alone.
-
-    Raises:
-        InputError: a scan has another shape.
-    """
-    found = []
-    for one in points_B if isinstance(points_B, list | tuple) else [points_B]:
-        points = np.asarray(one, dtype=np.float64)
-        if points.ndim < 2 or points.shape[-1] != 3:
-            raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-        points = points.reshape(-1, 3)
-        found.append(np.asarray(points[np.isfinite(points).all(axis=1)]))
-    return found
 
 
 def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: int) -> PreparedScan:

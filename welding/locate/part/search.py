@@ -222,8 +222,7 @@ def _places_for(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scene:
-    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the
-    masks."""
+    """What the search compares: heights (H,W), NaN for none, their limits around a cell, and the masks' transforms."""
 
     top: npt.NDArray[np.floating]
     lowest: npt.NDArray[Any]
