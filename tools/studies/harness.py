@@ -306,7 +306,7 @@ class Measured:
 
 def command_line() -> str:
     """The arguments of this program as a user types them, without the output folder."""
-    words = sys.argv[1:]
+    words = ["dev", *sys.argv[1 + (sys.argv[1:2] == ["dev"]) :]]
     if "--out" in words:
         k = words.index("--out")
         words = words[:k] + words[k + 2 :]
