@@ -131,7 +131,7 @@ def shot(seed: int, kinds: Sequence[str] | None = None, strength: float | None =
 
 
 @dataclass(frozen=True)
-class Verdict:
+class TagVerdict:
     """Whether a picture is accepted, why not, its errors in m with their stated deviations, and whether it is wrong."""
 
     kinds: tuple[str, ...]
@@ -156,14 +156,14 @@ def measured(picture: NDArray[np.uint8], p_KM: Array, limited: bool = True) -> t
     return found, np.full(3, np.nan) if found.X_KM is None else np.asarray(found.X_KM.translation()) - p_KM
 
 
-def judge(s: Shot) -> Verdict:
+def judge(s: Shot) -> TagVerdict:
     """Measure one picture with the program, and compare with the truth."""
     found, error = measured(s.picture, s.p_KM)
     if not found.valid:
-        return Verdict(s.kinds, False, found.reason)
+        return TagVerdict(s.kinds, False, found.reason)
     sigma = np.sqrt(np.diag(found.covariance_K))
     lateral = float(np.hypot(*error[:2]))
-    return Verdict(s.kinds, True, "", lateral, float(abs(error[2])), float(sigma[:2].max()), float(sigma[2]))
+    return TagVerdict(s.kinds, True, "", lateral, float(abs(error[2])), float(sigma[:2].max()), float(sigma[2]))
 
 
 def fit(count: int) -> tuple[Array, Array]:
@@ -199,7 +199,7 @@ def fit(count: int) -> tuple[Array, Array]:
     return results[0], results[1]
 
 
-def summary(verdicts: Sequence[Verdict]) -> str:
+def summary(verdicts: Sequence[TagVerdict]) -> str:
     """One line a kind of disturbance, one of all, and the causes of the refusals."""
     lines = [f"{'disturbance':14}{'pictures':>9}{'accepted':>9}{'wrong':>6}{'lateral mm':>12}{'depth mm':>10}"]
     for kind in (*KINDS, "all"):

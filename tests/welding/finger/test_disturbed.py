@@ -7,13 +7,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from tests.welding.finger.disturbed import DEPTH_M, JUDGED_SEED, LATERAL_M, Verdict, judge, measured, shot, summary
+from tests.welding.finger.disturbed import DEPTH_M, JUDGED_SEED, LATERAL_M, TagVerdict, judge, measured, shot, summary
 
 COUNT = 300
 
 
 @lru_cache(maxsize=1)
-def verdicts() -> list[Verdict]:
+def verdicts() -> list[TagVerdict]:
     return [judge(shot(JUDGED_SEED + k)) for k in range(COUNT)]
 
 
