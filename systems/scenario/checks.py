@@ -267,6 +267,7 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     scenario.welding.process.process()
+    scenario.welding.order.check()
     scenario.planning.planning_method()
     if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
         raise InputError(

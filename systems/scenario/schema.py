@@ -14,6 +14,7 @@ from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
+from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
 
 JobConfigOf = TypeVar("JobConfigOf")
@@ -167,6 +168,7 @@ class WeldingConfig:
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
+    order: WeldOrder = dc.field(default_factory=WeldOrder)
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
