@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import open3d
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from typer.testing import CliRunner
@@ -207,6 +208,11 @@ def test_a_result_corrects_points_and_names_how(result: CalibrationResult, tmp_p
     assert correction_note(result, tmp_path) is None
     corrected = replace(result, scanner_correction={"scale": 1.002, "gradient_per_m": [0.01, -0.01]})
     assert corrected.correct(points)[0] == pytest.approx(points[0] * (1.002 + 0.01 * 0.1 + 0.01 * 0.2), abs=1e-12)
+    grid, cloud = points.reshape(1, 2, 3), open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[:1]))
+    assert np.array_equal(corrected.correct(grid)[0], corrected.correct(points), equal_nan=True)
+    assert corrected.correct(cloud) == pytest.approx(corrected.correct(points)[:1])
+    with pytest.raises(InputError, match=r"\(N, 3\) or \(H, W, 3\) in metres; these are \(5, 4\)"):
+        corrected.correct(np.ones((5, 4)))
     file = save_result(corrected, tmp_path)
     note = correction_note(corrected, file) or ""
     assert f"weldcal apply {file} CLOUD" in note
