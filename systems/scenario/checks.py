@@ -266,6 +266,7 @@ def check_scenario(scenario: Scenario) -> None:
         )
     scenario.welding.process.process()
     scenario.welding.order.check()
+    scenario.welding.arc.check(scenario.robot.reports_arc)
     scenario.planning.planning_method()
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration
