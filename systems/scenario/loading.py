@@ -46,10 +46,10 @@ def _check_value(kind: Any, value: Any, place: str) -> None:
             _check_value(get_args(kind)[0], item, f"{place}[{k}]")
         return
     if kind is str and isinstance(value, int | float | date):
-        raise InputError(f"{place} is a text: write '{value}' in quotes.")
+        raise InputError(f"the value at '{place}' is a text: write '{value}' in quotes.")
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
     if isinstance(value, int | float | str) and {get_origin(k) or k for k in kinds} <= {list, NoneType}:
-        raise InputError(f"{place} is a list: write [{value}, ...].")
+        raise InputError(f"the value at '{place}' is a list: write [{value}, ...].")
     choices = {c.__name__: c for c in kinds if isinstance(c, type) and dc.is_dataclass(c)}
     if not choices or not isinstance(value, dict):
         return

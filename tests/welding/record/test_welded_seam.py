@@ -118,11 +118,11 @@ def test_each_limit_is_compared_with_the_extremes(limits: dict[str, object], out
 @pytest.mark.parametrize(
     ("order", "said"),
     [
-        ("{part: 4711}", "order.part is a text: write '4711' in quotes"),
-        ("{batch: 2026-11-27}", "order.batch is a text: write '2026-11-27' in quotes"),
+        ("{part: 4711}", "order.part' is a text: write '4711' in quotes"),
+        ("{batch: 2026-11-27}", "order.batch' is a text: write '2026-11-27' in quotes"),
         ("{wbs: a}", "the nearest one is 'wps'"),
         (f"{{note: {'x' * 201}}}", "one line of at most 200 characters"),
-        ("{limits: {speed_mm_s: 9}}", r"speed_mm_s is a list: write \[9, ...\]"),
+        ("{limits: {speed_mm_s: 9}}", r"speed_mm_s' is a list: write \[9, ...\]"),
         ("{limits: {speed_mm_s: [9, 7]}}", "the least and the largest value"),
         ("{limits: {heat_input_kJ_mm: [1, 2, 3]}}", "the least and the largest value"),
         ("{limits: {path_mm: 0}}", "path_mm must be a positive number"),
