@@ -102,10 +102,11 @@ class NextPose:
     """A pose to add, and the predicted sigma (3-D) at the work point before and after.
 
     ``X_BF`` is the first robot's pose, or None where the mounting leaves it open; ``q`` (rad) its joint angles where a
-    robot was named. The target is turned from a taken sample, ``like``; ``checked`` says what was.
+    robot was named. The target, at X_CM, is turned from a taken sample, ``like``; ``checked`` says what was.
     """
 
     X_BF: RigidTransform | None
+    X_CM: RigidTransform
     like: int
     turn_deg: float
     axis_C: Array
@@ -198,6 +199,7 @@ def next_pose(
     k, q = found
     return NextPose(
         X_BF=None if robot is None else as_transform(robot[k]),
+        X_CM=as_transform(G[k]),
         like=int(taken[like[k]]),
         turn_deg=float(np.degrees(angle[k])),
         axis_C=axis[k],

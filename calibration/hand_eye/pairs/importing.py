@@ -28,6 +28,7 @@ SCALE_SIGMA = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
 """A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
 _OTHER_SIZE = 2.0  # a choice: no board is measured wrong by a factor of 7
+_SQUARES_M = (0.005, 0.2)  # a choice: sizes of a board's squares, which some programs count
 LEAST_SCALE = 0.2  # a choice: 20 %, beyond a board's wrong scale, within a factor of unit
 """Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
 it."""
@@ -366,13 +367,13 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
             f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct"
             f" the unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
         )
-    if abs(np.log(factor)) > _OTHER_SIZE:
+    if abs(np.log(factor)) > _OTHER_SIZE and not _SQUARES_M[0] <= ratio <= _SQUARES_M[1]:
         raise InconsistentPoses(
             f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g}: the"
             " robot's or the camera's positions are in another unit, or of unknown scale. State the unit of both with"
             " --unit, or multiply the positions of one list."
         )
-    squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
+    squares = f", or the distances count squares of {ratio:.4g} m" if ratio < _SQUARES_M[1] else ""
     raise WrongScale(
         factor,
         f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from"
