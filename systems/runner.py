@@ -49,7 +49,7 @@ class Run(Generic[JobOf]):
     `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
     None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before
     the first motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
-    `seam_pictures`: the finger camera's picture where the torch of a seam, by its number, first came on and last went off.
+    `seam_pictures`: by a seam's number, the finger camera's picture where its torch first came on and last went off.
     """
 
     cell: Cell[JobOf]

@@ -142,8 +142,8 @@ class ProcessConfig:
 class ArcConfig:
     """How the arc starts and ends."""
 
-    # rest: the torch comes to rest on the seam's start before it is asked for; moving: it is asked for in passing; null:
-    # rest where robot.arc_input is wired, else moving
+    # rest: the torch comes to rest on the seam's start before it is asked for; moving: it is asked for in passing;
+    # null: rest where robot.arc_input is wired, else moving
     start: str | None = None
     start_s: float = 0.0  # how long the torch waits with the arc before it moves on, 0 to 10; needs start: rest
     crater_s: float = 0.0  # how long it waits at the seam's end before the arc goes out, 0 to 10

@@ -1,4 +1,4 @@
-"""Write the record of a welded part: record.json, record.csv, the pictures of each seam, and a section of the report."""
+"""Write the record of a welded part: record.json, record.csv, pictures of each seam, and the report's section."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

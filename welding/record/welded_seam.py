@@ -128,10 +128,11 @@ def _spread(above: Array, below: Array, stretch: NDArray[np.int_]) -> Spread:
     return Spread(float(quotients.min()), mean, float(quotients.max()))
 
 
+_PARTS = ("least", "mean", "most", "from", "to")
 RECORD_COLUMNS = (
     *WeldOrder().texts,
     *("written", "seam", "ended", "welded_mm", "arc_s", "arc_values"),
-    *(f"{name}_{part}" for name in RANGES for part in ("least", "mean", "most", "from", "to")),
+    *(f"{name}_{part}" for name in RANGES for part in _PARTS),
     *("path_mm_mean", "path_mm_most", "path_mm_to", "within_limits", "outside"),
     *("picture_start", "picture_end", "software", "scenario", "seed"),
 )
@@ -147,9 +148,7 @@ def record_row(found: WeldedSeam, order: WeldOrder, others: dict[str, object]) -
         low, high = getattr(order.limits, name) or (math.nan, math.nan)
         value = found.figures[name]
         cells = (value.least, value.mean, value.most, low, high)
-        row |= dict(
-            zip((f"{name}_{part}" for part in ("least", "mean", "most", "from", "to")), map(_cell, cells), strict=True)
-        )
+        row |= {f"{name}_{part}": _cell(cell) for part, cell in zip(_PARTS, cells, strict=True)}
     outside = found.outside(order.limits)
     limited = order.limits != OrderLimits()
     return row | {
