@@ -140,7 +140,7 @@ RECORD_COLUMNS = (
 
 
 def record_row(found: WeldedSeam, order: WeldOrder, others: dict[str, object]) -> dict[str, object]:
-    """A row of record.csv by RECORD_COLUMNS: `others` are its values that are not of the weld; empty where not known."""
+    """A row of record.csv by RECORD_COLUMNS: `others` are its values that are not of the weld; empty: not known."""
     row: dict[str, object] = {**order.texts, **others}
     row |= {"seam": found.seam, "welded_mm": _cell(found.welded_mm), "arc_s": _cell(found.arc_s)}
     row["arc_values"] = found.arc_values
