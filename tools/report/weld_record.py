@@ -73,7 +73,7 @@ class PartRecord:
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
-        found = []
+        found: list[tuple[str, ...]] = []
         for seam in self.seams:
             outside = seam.outside(self.order.limits)
             for name, (words, unit, digits) in _WORDS.items():
