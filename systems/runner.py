@@ -16,7 +16,7 @@ from pydrake.systems.sensors import RgbdSensor
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.interrupts import SIGTERM, deferred
-from weldcal.systems.messages import JobCommand, Scan
+from weldcal.systems.messages import Image, JobCommand, Scan
 from weldcal.systems.operator import KEYS
 from weldcal.systems.pacing import (
     HostTiming,
@@ -49,6 +49,7 @@ class Run(Generic[JobOf]):
     `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
     None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before
     the first motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
+    `seam_pictures`: by a seam's number, the finger camera's picture where its torch first came on and last went off.
     """
 
     cell: Cell[JobOf]
@@ -61,6 +62,7 @@ class Run(Generic[JobOf]):
     held_by_person: int = 0
     host: HostTiming | None = None
     share: float = 0.0
+    seam_pictures: dict[int, list[Image]] = field(default_factory=dict)
 
     @property
     def root(self) -> Context:
@@ -168,6 +170,7 @@ def run_cell(
     finished_at, has_panel, operator = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.operator
     next_at, pictures = dict.fromkeys(LOOKS, 0.0), PictureWait()
     precedence: Callable[[bool], None] = _no_precedence
+    lit = False
 
     def due(what: str, now: float) -> bool:
         if now < next_at[what] - 1e-9:
@@ -176,7 +179,7 @@ def run_cell(
         return True
 
     def watch(root: Context) -> EventStatus:
-        nonlocal finished_at
+        nonlocal finished_at, lit
         if operator.holds and not operator.ends and not _process_on(cell, root) and cell.job.can_stand(root):
             if run.clock is None or run.clock.stands or not _commanded(cell, root):
                 _stand(run, progress)
@@ -193,6 +196,9 @@ def run_cell(
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()
         command = cell.job.command(root)
+        if _process_on(cell, root) != lit:
+            lit = not lit
+            _keep_picture(run, root, command.seam)
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
             run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
@@ -312,6 +318,15 @@ def _keep_pace(run: Run[JobOf], root: Context) -> None:
     if pace != run.simulator.get_target_realtime_rate():
         run.simulator.set_target_realtime_rate(pace)
         run.simulator.ResetStatistics()  # the new rate counts from here on
+
+
+def _keep_picture(run: Run[JobOf], root: Context, seam: int) -> None:
+    """Store the finger camera's newest picture as the seam's first, or in place of its last."""
+    station = run.cell.station.diagram
+    if station.HasOutputPort("finger_camera.image"):
+        image: Image = station.GetOutputPort("finger_camera.image").Eval(station.GetMyContextFromRoot(root))
+        kept = run.seam_pictures.setdefault(seam, [])
+        kept[1:] = [image]  # the first one is appended
 
 
 def _keep_scan(run: Run[JobOf], root: Context) -> None:

@@ -41,6 +41,11 @@ class DriverConfig:
         """The arm that a simulated world holds in place of the controller's model; the model itself by default."""
         return arm
 
+    @property
+    def reports_arc(self) -> bool:
+        """Whether a robot's driver reports the arc of its power source."""
+        return False
+
     def torch_delay_s(self) -> float:
         """Time from the command of the torch to the torch, s, such as for the shielding gas."""
         return 0.0

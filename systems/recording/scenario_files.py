@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses as dc
+import re
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from pathlib import Path
@@ -45,7 +46,10 @@ def unpacked(files: Mapping[str, bytes], folder: Path) -> Scenario:
         if Path(name).name != name:
             raise InputError(f"The recording names a file outside of its folder ('{name}'): do not use it.")
         (folder / name).write_bytes(data)
-    return load_scenario(str(folder / SCENARIO))
+    scenario = load_scenario(str(folder / SCENARIO))
+    if not re.search(rb"^  arc:", files[SCENARIO], re.MULTILINE):
+        scenario.welding.arc.start = "moving"  # as before that key, for `packed` writes every key
+    return scenario
 
 
 def _files(config: Any) -> Iterator[tuple[Any, str]]:

@@ -265,6 +265,8 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     scenario.welding.process.process()
+    scenario.welding.order.check()
+    scenario.welding.arc.check(scenario.robot.reports_arc)
     scenario.planning.planning_method()
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration

@@ -2,10 +2,11 @@
 
 import dataclasses as dc
 import re
+from datetime import date
 from functools import cache, partial, reduce
 from operator import or_
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
 from pydrake.common.yaml import yaml_load, yaml_load_typed
@@ -44,7 +45,11 @@ def _check_value(kind: Any, value: Any, place: str) -> None:
         for k, item in enumerate(value):
             _check_value(get_args(kind)[0], item, f"{place}[{k}]")
         return
+    if kind is str and isinstance(value, int | float | date):
+        raise InputError(f"the value at '{place}' is a text: write '{value}' in quotes.")
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
+    if isinstance(value, int | float | str) and {get_origin(k) or k for k in kinds} <= {list, NoneType}:
+        raise InputError(f"the value at '{place}' is a list: write [{value}, ...].")
     choices = {c.__name__: c for c in kinds if isinstance(c, type) and dc.is_dataclass(c)}
     if not choices or not isinstance(value, dict):
         return

@@ -14,9 +14,11 @@ from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
+from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
 
 JobConfigOf = TypeVar("JobConfigOf")
+LONGEST_STAND_S = 10.0  # a choice: an arc that stands for longer burns through
 FILE = {"file": True}
 """Metadata of a key that names a file: a relative path is looked for beside the scenario first."""
 
@@ -137,6 +139,33 @@ class ProcessConfig:
 
 
 @dc.dataclass
+class ArcConfig:
+    """How the arc starts and ends."""
+
+    # rest: the torch comes to rest on the seam's start before it is asked for; moving: it is asked for in passing;
+    # null: rest where robot.arc_input is wired, else moving
+    start: str | None = None
+    start_s: float = 0.0  # how long the torch waits with the arc before it moves on, 0 to 10; needs start: rest
+    crater_s: float = 0.0  # how long it waits at the seam's end before the arc goes out, 0 to 10
+
+    def from_rest(self, reported: bool) -> bool:
+        """Whether the arc starts with the torch at rest; `reported`: the power source reports the arc."""
+        return self.start == "rest" or (self.start is None and reported)
+
+    def check(self, reported: bool) -> None:
+        """Raise InputError for another start, or for a time that cannot be stood."""
+        if self.start not in (None, "rest", "moving"):
+            raise InputError(f"welding.arc.start must be rest or moving, not '{self.start}'.")
+        for name in ("start_s", "crater_s"):
+            if not 0.0 <= getattr(self, name) <= LONGEST_STAND_S:
+                raise InputError(
+                    f"welding.arc.{name} must be from 0 to {LONGEST_STAND_S:g}, not {getattr(self, name):g}."
+                )
+        if self.start_s > 0.0 and not self.from_rest(reported):
+            raise InputError("welding.arc.start_s needs an arc that starts at rest: write welding.arc.start: rest.")
+
+
+@dc.dataclass
 class PlanningConfig:
     """The method of planning the seam from the workpiece's scan."""
 
@@ -163,6 +192,8 @@ class WeldingConfig:
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
+    arc: ArcConfig = dc.field(default_factory=ArcConfig)
+    order: WeldOrder = dc.field(default_factory=WeldOrder)
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must

@@ -228,6 +228,10 @@ welding:
   clearance_mm: 30.0
   seam_length_mm: 100.0
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
+  arc: {start: rest, start_s: 0.4, crater_s: 0.6}
+  order: {order: o, wps: w, wpqr: q, drawing: d, part: p, serial: s, batch: b, operator: x, material: m, filler: f,
+    filler_batch: fb, gas: g, position: PA, note: n, limits: {heat_input_kJ_mm: [0.5, 1.0], speed_mm_s: [7.0, 9.0],
+    current_A: [80.0, 100.0], voltage_V: [10.0, 12.0], path_mm: 0.4}}
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4

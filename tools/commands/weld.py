@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result
 from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
@@ -18,7 +18,6 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import feature_standard
-from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Progress, Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
@@ -30,16 +29,14 @@ from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, li
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, fit_up_csv, live_calibration_error, weld_outcome
-from weldcal.welding.record.process import speed_along, torch_angles
+from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
+from weldcal.tools.report.weld_record import part_record, weld_record
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
-from weldcal.welding.servo.state import Phase
 
 SCANS: Final = "scans"
 SUMMARY: Final = "summary.json"
 FIT_UP_CSV: Final = "fit_up.csv"
 PRESET: Final = "straight_groove"
-PHASE_NAMES = [str(phase) for phase in Phase]
 
 
 @command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
@@ -110,9 +107,10 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
         if status.estimate is None
         else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
     )
-    return DemoResult(
-        options=options, run=run, status=status, calibration=error, weld=weld_outcome(cell, run.root), robot=robot
-    )
+    weld = weld_outcome(cell, run.root)
+    log = None if weld is None else weld_record(run, weld, options.seed, options.scenario, robot)
+    record = None if log is None else part_record(run, log)
+    return DemoResult(options=options, run=run, status=status, calibration=error, weld=weld, robot=robot, record=record)
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
@@ -122,9 +120,9 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_calibration(run.cell, result.status, result.options.seed, folder)
         write_scans(run, result.status, folder / SCANS, result.robot)
-        if result.weld is not None:
-            record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
-            write_weld_log(record, folder)
+        if result.record is not None:
+            write_weld_log(result.record.log, folder)
+            result.record.write(folder)
         if records := run.cell.job.planned_seam(run.root).records:
             write_atomic(folder / FIT_UP_CSV, fit_up_csv(records))
         finished.write_recording(folder)
@@ -253,53 +251,6 @@ def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
 
 def _numbers(values: np.ndarray) -> list[float]:
     return [float(v) for v in values]
-
-
-def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
-    """The weld record from the log; it contains no ground truth of the simulation."""
-    log, cell, config = weld.log, run.cell, run.cell.job.servo_config
-    process = cell.scenario.welding.process.process()
-    p_BW = log.p_BRobot + log.R_BT @ config.p_TW
-    speed = speed_along(log.time, p_BW)
-    up = np.full((len(log.time), 3), np.nan)
-    if weld.planned is not None:
-        up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
-    moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
-    work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
-    named = log.telemetry
-    table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
-    table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
-    table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
-    table |= {f"q_B{frame}_{axis}": named[f"q_BT_{axis}"] for frame in "TW" for axis in "wxyz"}
-    tip, target = columns(named, "tip"), columns(named, "target")
-    vectors = {"p_BW": p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
-    table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
-    table |= {
-        "torch_speed_m_s": speed,
-        "torch_speed_commanded_m_s": named["torch_speed"],
-        "tip_speed_m_s": named["tip_speed"],
-        "omega_rad_s": named["omega"],
-        "work_angle_rad": np.where(moving, work, np.nan),
-        "travel_angle_rad": np.where(moving, travel, np.nan),
-        "heat_input_J_m": process.heat_input(np.where(log.torch_on, speed, np.nan)),
-    }
-    settings = {
-        "software": software_version(),
-        "scenario": scenario,
-        "seed": seed,
-        "robot": robot,
-        "servo_period_s": config.period_s,
-        "weld_speed_m_s": config.weld_speed_m_s,
-        "delta_d_m": config.deflection.delta_d_m,
-        "axial_d_m": config.deflection.axial_d_m,
-        "omega_max_rad_s": config.limits.omega_max_rad_s,
-        "chord_m": config.tool.torch_offset_m,
-        "law": config.law,
-        "felt": felt_seams(run),
-        "ended": run.reason or "done",
-    }
-    phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)
-    return WeldRecord(table, phase, process, settings)
 
 
 def write_weld_log(record: WeldRecord, folder: Path) -> Path:

@@ -35,8 +35,10 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
+from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document
+from weldcal.tools.report.weld_record import PartRecord
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
+from weldcal.welding.record.weld_log import heat_summary
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
@@ -53,6 +55,7 @@ class DemoResult:
     status: CalibrationStatus
     calibration: CalibrationError | None
     weld: WeldOutcome | None
+    record: PartRecord | None = None
     robot: str = "simulated"
 
     @property
@@ -81,9 +84,10 @@ class DemoResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the job warned of and did not hold for."""
+        """What the job warned of and did not hold for, and what is outside the order's limits."""
         sequencer = self.run.cell.job.sequencer
-        return sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+        warned = sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+        return warned if self.record is None else (*warned, *self.record.outside)
 
     @property
     def first(self) -> FirstScreen:
@@ -228,8 +232,10 @@ class DemoResult:
         if self.weld is not None and self.weld.speed is not None:
             found["torch_speed_cv"] = self.weld.speed.cv
             found["welded_mm"] = 1e3 * self.weld.speed.welded_m
-            heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())
-            found["heat_input_kJ_mm"] = None if heat is None else float(heat.mean())
+            heat = None if self.record is None else heat_summary(self.record.log)
+            found["heat_input_kJ_mm"] = None if heat is None else heat[0]
+        if self.record is not None:
+            found |= self.record.summary()
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
@@ -323,7 +329,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         tip_error_mm=None if weld is None else 1e3 * tip_error(weld),
         pictures=pictures,
         planned=_planned(result),
-        heat=_process(result),
+        record=result.record,
         pose=pose,
         observations=_observations(result),
         timing=_timing(result),
@@ -378,29 +384,6 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
             )
             rows.append((f"fit-up of seam {k}: {what}", figures))
     return rows
-
-
-def _process(result: DemoResult) -> list[tuple[str, str]]:
-    """Return the arc as it was set, and its heat input where that is known."""
-    weld, process = result.weld, result.run.cell.scenario.welding.process.process()
-    if weld is None:
-        return []
-    if process.missing is not None:
-        return [("heat input", f"not known: {process.missing}")]
-    heat = heat_input_kJ_mm(weld, process)
-    if heat is None:
-        return []
-    least, mean, most = (fixed(float(f(heat)), 3) for f in (np.min, np.mean, np.max))
-    return [
-        (
-            "process",
-            (
-                f"{process.name or 'not named'}, {process.current_A:g} A, {process.voltage_V:g} V as set; k ="
-                f" {process.k:g}"
-            ),
-        ),
-        ("heat input", f"{mean} kJ/mm (mean; from {least} to {most})"),
-    ]
 
 
 def _timing(result: DemoResult) -> list[tuple[str, ...]]:

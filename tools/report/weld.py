@@ -24,14 +24,7 @@ from weldcal.systems.runner import Run
 from weldcal.systems.station import Truth
 from weldcal.tools.report.files import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
-from weldcal.welding.record.process import (
-    PathError,
-    SpeedStatistics,
-    WeldProcess,
-    path_error,
-    speed_along,
-    speed_statistics,
-)
+from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
@@ -75,6 +68,7 @@ class WeldLog:
     p_BTorch: Array
     deflection_T: Array
     sigma_min: Array
+    arc: Array | None = None  # (N, 3) arc reported 1 or 0, current A, voltage V of the power source; NaN where none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -185,6 +179,7 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         return None
     tool = cell.station.tool
     assert tool is not None
+    missing = np.full((1, rows), np.nan)
     named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
     p_BRobot = columns(named, "p_BT")
     q = columns(named, "q_BT", "wxyz")
@@ -200,6 +195,7 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         p_BTorch=np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"][0, keep]),
+        arc=np.vstack([series.get("arc", missing), series.get("arc_values", missing.repeat(2, axis=0))])[:, keep].T,
     )
 
 
@@ -272,13 +268,6 @@ def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
     touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
     number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
     return [number == k for k in range(int(number[-1]) + 1)]
-
-
-def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:
-    """Heat input of each row with a burning arc, kJ/mm; None where it is not known."""
-    if process.missing is not None or not weld.log.torch_on.any():
-        return None
-    return 1e-6 * process.heat_input(speed_along(weld.log.time, weld.log.p_BTorch)[weld.log.torch_on])
 
 
 def felt_seams(run: Run[WeldJob]) -> list[bool]:

@@ -75,19 +75,22 @@ class WeldProcess:
             return None
         return "No welding current and voltage were given, so the log states the torch speed and no heat input."
 
-    def heat_input(self, speed_m_s: ArrayLike) -> Array:
+    def heat_input(
+        self, speed_m_s: ArrayLike, current_A: ArrayLike = math.nan, voltage_V: ArrayLike = math.nan
+    ) -> Array:
         """Heat brought in per length of weld, k U I / v, in J/m; NaN without current and voltage, infinite at rest.
 
         Args:
             speed_m_s: torch speed, any shape; NaN where the arc is off.
+            current_A, voltage_V: measured, of the same shape; where one is NaN both are the set ones.
 
         Source: EN 1011-1:2009, section 19, and ISO/TR 18491 (direct current or mean values: no pulses are resolved).
         """
         v = np.asarray(speed_m_s, dtype=float)
-        if self.current_A is None or self.voltage_V is None or self.k is None:
-            return np.full(v.shape, math.nan)
+        power = np.asarray(current_A, dtype=float) * np.asarray(voltage_V, dtype=float)
+        power_set = math.nan if self.current_A is None or self.voltage_V is None else self.current_A * self.voltage_V
         with np.errstate(divide="ignore"):
-            return np.asarray(self.k * self.voltage_V * self.current_A / np.abs(v))
+            return np.asarray((self.k or math.nan) * np.where(np.isfinite(power), power, power_set) / np.abs(v))
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,11 @@ COLUMNS: tuple[LogColumn, ...] = (
     LogColumn("gain", "", "", "gain of the tag in use, from the touch-on calibration"),
     LogColumn("n_points", "", "", "committed tactile points so far"),
     LogColumn("sigma_min", "", "", "least singular value of the arm's length-scaled Jacobian"),
+    LogColumn("arc", "", "", "1: the power source reports an arc, 0: none; nan where its signal is not wired"),
+    LogColumn("current_A", "A", "", "welding current as the power source measures it; nan where it gives none"),
+    LogColumn("voltage_V", "V", "", "arc voltage as the power source measures it; nan where it gives none"),
 )
+_LATER = ("arc", "current_A", "voltage_V")  # columns that logs of before do not have
 NAMES = tuple(c.name for c in COLUMNS)
 _NUMBERS = tuple(name for name in NAMES if name != "phase")
 
@@ -110,8 +114,13 @@ class WeldRecord:
 
     @property
     def torch_on(self) -> NDArray[np.bool_]:
-        """Where the arc burned, (N,)."""
+        """Where the torch was on, (N,)."""
         return np.asarray(self.columns["torch_on"] > 0.5)
+
+    @property
+    def arc(self) -> NDArray[np.bool_]:
+        """Where the arc burned, (N,): as the power source reports it, else while the torch was on."""
+        return np.asarray(self.torch_on & (np.nan_to_num(self.columns["arc"], nan=1.0) > 0.5))
 
     def points(self, name: str) -> Array:
         """A point or displacement (N,3) m: "p_BW", "p_BT", "p_BTip", "p_BSeam" or "deflection"."""
@@ -150,7 +159,7 @@ def weld_log_texts(record: WeldRecord) -> tuple[str, str]:
         "process": {
             **asdict(record.process),
             "efficiency_in_use": record.process.k,
-            "values": "as set, not measured",
+            "values": "as set; the columns current_A and voltage_V are measured, where they are numbers",
             "heat_input": record.process.missing or "k U I / v, EN 1011-1",
         },
         "columns": [c._asdict() for c in COLUMNS],
@@ -186,12 +195,13 @@ def load_weld_log(path: Path | str) -> WeldRecord:
     if not rows or len(rows) != header["rows"] + 1:
         raise WeldLogError(f"{csv_path} has {len(rows) - 1} rows, and {header_path.name} says {header['rows']}.")
     names = rows[0]
-    missing = [name for name in NAMES if name not in names]
+    missing = [name for name in NAMES if name not in (*names, *_LATER)]
     if missing:
         raise WeldLogError(f"{csv_path} lacks the column '{missing[0]}'.")
-    columns = {name: np.empty(len(rows) - 1) for name in _NUMBERS}
+    columns = {name: np.full(len(rows) - 1, math.nan) for name in _NUMBERS}
+    there = [name for name in _NUMBERS if name in names]
     for k, row in enumerate(rows[1:]):
-        for name in _NUMBERS:
+        for name in there:
             try:
                 columns[name][k] = float(row[names.index(name)])
             except (ValueError, IndexError):
@@ -238,6 +248,6 @@ def heat_summary(record: WeldRecord) -> tuple[float, float] | None:
     """Mean and largest heat input in kJ/mm over the weld, by time; None where it is not known."""
     heat = record["heat_input_J_m"][record.torch_on]
     good = heat[np.isfinite(heat)]
-    if record.process.missing is not None or not len(good):
+    if not len(good):
         return None
     return 1e-6 * float(good.mean()), 1e-6 * float(good.max()) if len(good) == len(heat) else math.inf

@@ -215,6 +215,7 @@ def _resumed(state: WeldingState, held: Interruption, sample: ServoSample) -> We
         u_n=0.0,
         u_a=0.0,
         arc_waited_s=0.0,
+        stand="",
         progress_log=(),
         # friction has turned: the tip counts as in contact, and as proven only when it leans on its wall again
         proven=False,

@@ -266,6 +266,8 @@ class TorchControl:
             does not start within so much of the seam is a fault.
         ignition_limit_s: longest time from the torch's start to an established arc; arc_lost_s: longest time without it
             after.
+        from_rest: the torch comes to rest at the seam's start before it is asked for; start_s: it stands so long with
+            the arc; crater_s: it stands so long at the seam's end before the arc goes out.
     """
 
     k_b: float = 4.0
@@ -277,9 +279,12 @@ class TorchControl:
     ignition_window_m: float = 10.0e-3
     ignition_limit_s: float = 2.0
     arc_lost_s: float = 0.3
+    from_rest: bool = False
+    start_s: float = 0.0
+    crater_s: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_numbers("torch.", self, signed=("work_angle_rad",))
+        _check_numbers("torch.", self, signed=("work_angle_rad",), zero=("start_s", "crater_s"))
 
 
 @dataclass(frozen=True, kw_only=True)

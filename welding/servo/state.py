@@ -183,6 +183,8 @@ class WeldingState:
     lit_at: float = math.nan
     arc_seen: bool = False
     arc_waited_s: float = 0.0
+    stand: str = ""
+    stood_s: float = 0.0
     V: Array = field(default_factory=lambda: np.zeros(6))
     V_stop: Array = field(default_factory=lambda: np.zeros(6))
     stopped_ticks: int = 0

@@ -10,6 +10,7 @@ from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.seam.refinement import drop_pending
+from weldcal.welding.servo.arc import Stand, stand, stand_step, way_to_rest_m
 from weldcal.welding.servo.contact import (
     contact_lost,
     freshness,
@@ -123,6 +124,9 @@ def welding_step(
     if state.phase in _MOVING and state.torch_on and not sample.arc:
         state, V, problem = wait_for_arc(state, sample, config, dt)
         return _answer(state, V, config, Diagnostics()) if problem is None else _rest(fault(state, problem), config)
+    if state.phase in _MOVING and state.stand:
+        state, V, over = stand_step(with_arc(state, sample), sample, config, dt)
+        return _rest(_done(state), config) if over else _answer(state, V, config, Diagnostics())
     if state.phase in _MOVING:
         return _weld(with_arc(state, sample), sample, config, dt)
     return _rest(state, config)
@@ -291,17 +295,21 @@ def _weld(
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(fault(state, text), config)
     # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
-    start = start_arc(state, curve)
-    lit = state.torch_on or (target.s >= start and error < config.torch.ignition_error_m)
-    burning = lit and target.s < state.s_end
+    start, torch = start_arc(state, curve), config.torch
+    on_the_way = way_to_rest_m(motion.v_torch, config)
+    there = target.s >= start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
+    burning = (state.torch_on or there) and target.s < state.s_end
+    if burning and not state.torch_on and torch.from_rest:
+        return _stand(state, motion.V_BT, Stand.START, config)
+    if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= state.s_end - on_the_way:
+        return _stand(state, motion.V_BT, Stand.CRATER, config)
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
     state = changed(state, torch_on=burning, lit_at=lit_at)
     problem = unlit(state, target.s, target.s - start, error, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
     if target.s >= state.s_end:
-        done = changed(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_ticks=0)
-        return _rest(done, config)
+        return _rest(_done(state), config)
     diagnostics = Diagnostics(
         e_t=e_n,
         e_height=e_b,
@@ -313,6 +321,17 @@ def _weld(
         p_BTorch_target=target.point,
     )
     return _answer(state, motion.V_BT, config, diagnostics)
+
+
+def _stand(state: WeldingState, V: Array, why: Stand, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
+    """The tick in which the tool begins to stand, with the motion of this tick still."""
+    state = stand(changed(state, V=V), why)
+    return _answer(state, state.V_stop, config, Diagnostics())
+
+
+def _done(state: WeldingState) -> WeldingState:
+    """The end of the seam: the arc off, and the motion to rest."""
+    return changed(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_ticks=0)
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:

@@ -86,6 +86,11 @@ class UrRtde(DriverConfig):
             return limits
         return limits.following() if self.follow else limits.in_lockstep()
 
+    @property
+    def reports_arc(self) -> bool:
+        """See DriverConfig."""
+        return self.arc_input is not None
+
     def torch_delay_s(self) -> float:
         """The time of gas before the torch, where a valve is wired, and of the set points, where there are some."""
         points_s = 0.0 if self.wire_feed is None and self.arc_voltage is None else SETTLES_S

@@ -370,8 +370,8 @@ def _add_welding(
     )
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
-    others = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
-    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, others))
+    more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
+    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, more))
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),
@@ -392,9 +392,9 @@ def _add_welding(
         "deflection": finger.GetOutputPort("deflection"),
         "position": position,
     }
-    for name, truth in (("tip_and_deflection", "cheat.contact"), ("torch", "cheat.torch")):
-        if station.diagram.HasOutputPort(truth):
-            logged[name] = out(truth)
+    others = {"tip_and_deflection": "cheat.contact", "torch": "cheat.torch"}
+    others |= {"arc": "arm.arc_established", "arc_values": "arm.arc_values"}  # where the power source gives them
+    logged |= {name: out(port) for name, port in others.items() if station.diagram.HasOutputPort(port)}
     logged["torch_on"] = spine.switch.GetOutputPort("process_on")
     ports = {"velocity": guard.GetOutputPort("velocity"), "margin": guard.GetOutputPort("margin"), "logged": logged}
     ports["torch_wanted"] = servo.GetOutputPort("torch_on")

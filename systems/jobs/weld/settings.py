@@ -88,7 +88,12 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         law=welding.law,
         windows=SeamWindows.of(tool),
         felt=felt,
-        torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
+        torch=TorchControl(
+            ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s(),
+            from_rest=welding.arc.from_rest(scenario.robot.reports_arc),
+            start_s=welding.arc.start_s,
+            crater_s=welding.arc.crater_s,
+        ),
         limits=MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2) if tool.chord_m < NEAR_M else MotionLimits(),
     )
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
 from weldcal.models.errors import InputError
+from weldcal.systems.recording.scenario_files import packed, unpacked
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.welding.record.process import (
     EFFICIENCY,
@@ -118,3 +121,29 @@ def test_a_weld_shorter_than_its_two_ends_has_no_middle() -> None:
     found = PathError(np.array([0.0, 4e-3, 8e-3]), np.array([1e-4, 3e-4, 2e-4]), np.zeros(3)).ends_m()
     assert found[:2] == pytest.approx((3e-4, 3e-4))
     assert math.isnan(found[2])
+
+
+@pytest.mark.parametrize(
+    ("arc", "said"),
+    [
+        ("{start: soon}", "rest or moving"),
+        ("{crater_s: 11.0}", "crater_s must be from 0 to 10"),
+        ("{start_s: -1.0}", "start_s must be from 0 to 10"),
+        ("{start_s: 0.5}", "write welding.arc.start: rest"),
+    ],
+)
+def test_an_arc_that_cannot_start_so_is_refused(arc: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        load_scenario("s_groove", f"welding: {{arc: {arc}}}")
+
+
+def test_a_reported_arc_starts_at_rest_and_that_of_an_old_recording_does_not(tmp_path: Path) -> None:
+    wired = load_scenario("wired_straight_groove")
+    assert wired.welding.arc.from_rest(wired.robot.reports_arc)
+    files = packed(wired)
+    assert unpacked(files, tmp_path).welding.arc.start is None
+    text = files["scenario.yaml"].decode()
+    old = re.sub(r"^  arc:.*\n(?:    .*\n)*", "", text, flags=re.MULTILINE)
+    assert old != text
+    before = unpacked({"scenario.yaml": old.encode()}, tmp_path)
+    assert not before.welding.arc.from_rest(before.robot.reports_arc)

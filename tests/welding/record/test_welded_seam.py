@@ -1,0 +1,182 @@
+"""The record of a part: figures by stretches against welds computed by hand, limits, the order, and its files."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from weldcal.models.errors import InputError
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.report.weld_record import PartRecord
+from weldcal.welding.record.order import OrderLimits, WeldOrder, WeldOrderError
+from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.record.weld_log import NAMES, WeldRecord, load_weld_log, weld_log_texts
+from weldcal.welding.record.welded_seam import RECORD_COLUMNS, WeldedSeam, seam_rows, welded_seam
+
+TICK_S = 0.008
+MAG = WeldProcess("MAG", 150.0, 20.0)
+
+
+def log(speeds: list[float], process: WeldProcess = MAG, **columns: list[float]) -> WeldRecord:
+    """A log of one touch of 5 ticks and then one tick at each speed (m/s) with the torch on."""
+    n, touch = len(speeds) + 5, [np.nan] * 5
+    table = {name: np.full(n, np.nan) for name in NAMES if name != "phase"}
+    table |= {"time_s": TICK_S * np.arange(n), "torch_on": np.r_[np.zeros(5), np.ones(n - 5)]}
+    table |= {"torch_speed_m_s": np.r_[np.zeros(5), speeds], "e_t_m": np.zeros(n), "e_height_m": np.zeros(n)}
+    table |= {name: np.r_[touch, values] for name, values in columns.items()}
+    return WeldRecord(table, np.array(["TOUCH"] * 5 + ["TRACK"] * (n - 5)), process, {"scenario": "s", "seed": 1})
+
+
+def only(record: WeldRecord) -> WeldedSeam:
+    (found,) = (welded_seam(record, number, rows) for number, rows in seam_rows(record, [0]))
+    assert found is not None
+    return found
+
+
+# 20 mm at 10 mm/s and 10 mm at 5 mm/s: two seconds each.
+TWO_SPEEDS = [0.010] * 250 + [0.005] * 251
+
+
+def test_set_values_give_the_heat_of_each_stretch() -> None:
+    found = only(log(TWO_SPEEDS))
+    heat, speed = found.figures["heat_input_kJ_mm"], found.figures["speed_mm_s"]
+    assert (found.welded_mm, found.arc_s) == pytest.approx((30.0, 4.0), rel=0.01)
+    # 0.8 * 20 V * 150 A = 2400 W: 0.24 and 0.48 kJ/mm, and 9600 J over 30 mm
+    assert (heat.least, heat.mean, heat.most) == pytest.approx((0.24, 0.32, 0.48), rel=0.01)
+    assert (speed.least, speed.mean, speed.most) == pytest.approx((5.0, 7.5, 10.0), rel=0.01)
+    assert found.arc_values == "set"
+
+
+def test_measured_values_count_more_than_set_ones() -> None:
+    amps = [100.0] * 250 + [300.0] * 251
+    found = only(log(TWO_SPEEDS, current_A=amps, voltage_V=[25.0] * 501))
+    heat, current = found.figures["heat_input_kJ_mm"], found.figures["current_A"]
+    assert found.arc_values == "measured"
+    assert (current.least, current.mean, current.most) == pytest.approx((100.0, 200.0, 300.0), rel=0.01)
+    # 0.8 * 25 V * (100, 300) A: 2000 W at 10 mm/s and 6000 W at 5 mm/s; 16 kJ over 30 mm
+    assert (heat.least, heat.mean, heat.most) == pytest.approx((0.2, 0.5333, 1.2), rel=0.01)
+
+
+def test_without_arc_values_no_heat_is_stated() -> None:
+    found = only(log(TWO_SPEEDS, WeldProcess()))
+    assert found.arc_values == "unknown"
+    assert np.isnan(found.figures["heat_input_kJ_mm"].mean)
+    assert found.outside(OrderLimits(heat_input_kJ_mm=[0.1, 9.0])) == ("heat_input_kJ_mm",)
+    assert found.outside(OrderLimits(speed_mm_s=[1.0, 20.0])) == ()
+
+
+def test_the_time_before_the_arc_is_no_time_of_welding() -> None:
+    waiting = only(log([0.0] * 100 + [0.010] * 251, arc=[0.0] * 100 + [1.0] * 251))
+    assert (waiting.arc_s, waiting.welded_mm) == pytest.approx((2.0, 20.0), rel=0.01)
+    standing = only(log([0.0] * 100 + [0.010] * 251))
+    # 0.8 s of standing with the arc on: 1.8 s for the first 10 mm
+    assert standing.figures["speed_mm_s"].least == pytest.approx(10.0 / 1.8, rel=0.01)
+
+
+def test_a_hold_is_no_time_of_welding() -> None:
+    record = log([0.010] * 251)
+    record["time_s"][100:] += 30.0
+    assert only(record).arc_s == pytest.approx(2.0, rel=0.01)
+
+
+def test_pieces_of_a_seam_share_a_row() -> None:
+    one = log([0.010] * 251)
+    table = {name: np.concatenate([one[name]] * 3) for name in one.columns}
+    table["time_s"] = TICK_S * np.arange(len(table["time_s"]))
+    record = WeldRecord(table, np.concatenate([one.phase] * 3), MAG)
+    found = {number: rows.sum() for number, rows in seam_rows(record, [0, 0, 4])}
+    assert found == {0: 2 * len(one), 4: len(one)}
+
+
+def test_an_arc_that_never_burned_has_no_row() -> None:
+    record = log([0.010] * 20, arc=[0.0] * 20)
+    assert welded_seam(record, 0, np.ones(len(record), dtype=bool)) is None
+
+
+@pytest.mark.parametrize(
+    ("limits", "outside"),
+    [
+        ({"heat_input_kJ_mm": [0.2, 0.5], "speed_mm_s": [4.9, 10.1], "current_A": [150.0, 160.0]}, ()),
+        ({"heat_input_kJ_mm": [0.25, 0.5]}, ("heat_input_kJ_mm",)),
+        ({"speed_mm_s": [4.9, 9.9]}, ("speed_mm_s",)),
+        ({"voltage_V": [21.0, 25.0], "path_mm": 0.29}, ("voltage_V", "path_mm")),
+        ({"path_mm": 0.31}, ()),
+    ],
+)
+def test_each_limit_is_compared_with_the_extremes(limits: dict[str, object], outside: tuple[str, ...]) -> None:
+    off = [1e-4] * 500 + [3e-4]
+    assert only(log(TWO_SPEEDS, e_t_m=off)).outside(OrderLimits(**limits)) == outside  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        ("{part: 4711}", "order.part' is a text: write '4711' in quotes"),
+        ("{batch: 2026-11-27}", "order.batch' is a text: write '2026-11-27' in quotes"),
+        ("{wbs: a}", "the nearest one is 'wps'"),
+        (f"{{note: {'x' * 201}}}", "one line of at most 200 characters"),
+        ("{limits: {speed_mm_s: 9}}", r"speed_mm_s' is a list: write \[9, ...\]"),
+        ("{limits: {speed_mm_s: [9, 7]}}", "the least and the largest value"),
+        ("{limits: {heat_input_kJ_mm: [1, 2, 3]}}", "the least and the largest value"),
+        ("{limits: {path_mm: 0}}", "path_mm must be a positive number"),
+    ],
+)
+def test_an_order_that_cannot_be_is_refused(order: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        load_scenario("s_groove", f"welding: {{order: {order}}}")
+
+
+def test_a_line_break_in_an_order_is_refused() -> None:
+    with pytest.raises(WeldOrderError, match="one line"):
+        WeldOrder(note="a\nb").check()
+
+
+def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -> None:
+    order = WeldOrder(wps="WPS-12", part="0711", limits=OrderLimits(speed_mm_s=[6.0, 11.0]))
+    record = log(TWO_SPEEDS)
+    picture = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    png = cv2.imencode(".png", picture)[1].tobytes()
+    PartRecord(order=order, log=record, seams=(only(record),), pictures={"seam_1_start": png}).write(tmp_path)
+    with (tmp_path / "record.csv").open(newline="") as table:
+        (row,) = csv.DictReader(table)
+    assert (row["wps"], row["part"], row["seam"], row["arc_values"]) == ("WPS-12", "0711", "1", "set")
+    assert (row["within_limits"], row["outside"], row["speed_mm_s_from"]) == ("no", "speed_mm_s", "6.0")
+    assert float(row["heat_input_kJ_mm_mean"]) == pytest.approx(0.32, rel=0.01)
+    assert (row["picture_start"], row["picture_end"]) == ("pictures/seam_1_start.png", "")
+    shown = cv2.imread(str(tmp_path / row["picture_start"]), cv2.IMREAD_GRAYSCALE)
+    assert (shown == picture).all()
+    document = json.loads((tmp_path / "record.json").read_text())
+    assert document["order"] == {"wps": "WPS-12", "part": "0711", "limits": {"speed_mm_s": [6.0, 11.0]}}
+    assert document["seams"][0]["figures"]["speed_mm_s"]["least"] == pytest.approx(5.0, rel=0.01)
+    assert re.fullmatch(
+        r"Seam 1: travel speed is 5\.0 to 10\.0, and the limit is 6 to 11\.", *document["outside_limits"]
+    )
+
+
+def test_every_column_of_the_record_is_in_the_document(repository: Path) -> None:
+    page = (repository / "docs" / "reference" / "weld_log_columns.md").read_text()
+    named = set(re.findall(r"`([A-Za-z_]+)`", page.partition("## The columns of a record")[2]))
+    like_heat = {
+        name.replace("heat_input_kJ_mm", other) for name in named for other in ("speed_mm_s", "current_A", "voltage_V")
+    }
+    assert set(RECORD_COLUMNS) <= named | like_heat
+
+
+def test_a_log_of_before_is_read_without_the_later_columns(tmp_path: Path) -> None:
+    table, header = weld_log_texts(log([0.010] * 20))
+    rows = [line.rsplit(",", 3)[0] for line in table.splitlines()]
+    assert rows[0].endswith("sigma_min")
+    old = "\n".join(rows) + "\n"
+    (tmp_path / "weld.csv").write_text(old)
+    document = json.loads(header) | {"sha256": hashlib.sha256(old.encode()).hexdigest()}
+    (tmp_path / "weld.json").write_text(json.dumps(document))
+    found = load_weld_log(tmp_path)
+    assert np.isnan(found["current_A"]).all()
+    assert (found.arc == found.torch_on).all()
