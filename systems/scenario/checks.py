@@ -267,6 +267,9 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     scenario.welding.process.process()
+    weave = scenario.welding.weave
+    if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
+        raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
     scenario.planning.planning_method()
     if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
         raise InputError(

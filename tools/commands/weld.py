@@ -261,15 +261,17 @@ def _numbers(values: np.ndarray) -> list[float]:
 def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
     """The weld record from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
+    named = log.telemetry
     process = cell.scenario.welding.process.process()
     p_BW = log.p_BRobot + log.R_BT @ config.p_TW
-    speed = speed_along(log.time, p_BW)
+    speed = travel_speed = speed_along(log.time, p_BW)
+    if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
+        travel_speed = speed_along(log.time, np.outer(named["s_torch"], [1.0, 0.0, 0.0]))
     up = np.full((len(log.time), 3), np.nan)
     if weld.planned is not None:
         up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
     moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
     work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
-    named = log.telemetry
     table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
     table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
     table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
@@ -284,7 +286,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_rad_s": named["omega"],
         "work_angle_rad": np.where(moving, work, np.nan),
         "travel_angle_rad": np.where(moving, travel, np.nan),
-        "heat_input_J_m": process.heat_input(np.where(log.torch_on, speed, np.nan)),
+        "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan)),
     }
     settings = {
         "software": software_version(),

@@ -36,7 +36,14 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows
 from weldcal.tools.report.run import RunOptions, robot_timing
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
+from weldcal.tools.report.weld import (
+    CalibrationError,
+    WeldOutcome,
+    felt_seams,
+    fit_up_document,
+    heat_input_kJ_mm,
+    weave_document,
+)
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -235,6 +242,8 @@ class DemoResult:
             found["welded_mm"] = 1e3 * self.weld.speed.welded_m
             heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())
             found["heat_input_kJ_mm"] = None if heat is None else float(heat.mean())
+        if self.weld is not None and self.weld.weave:
+            found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
