@@ -7,6 +7,7 @@ fast.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from weldcal.models.errors import InputError, WeldcalError
     from weldcal.tools.api import (
         build_cell,
         calibrate,
@@ -20,8 +21,28 @@ if TYPE_CHECKING:
     )
 
     __version__: str
+else:
+    from weldcal.models import exported
+
+    _load, _names = exported(__name__)
+
+    def __getattr__(name: str) -> object:
+        if name != "__version__":
+            return _load(name)
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("weldcal")
+        except PackageNotFoundError:
+            raise AttributeError("weldcal is not installed, so its version is not known") from None
+
+    def __dir__() -> list[str]:
+        return [*_names(), "__version__"]
+
 
 __all__ = [
+    "InputError",
+    "WeldcalError",
     "build_cell",
     "calibrate",
     "fit_flange",
@@ -32,23 +53,3 @@ __all__ = [
     "run",
     "verify",
 ]
-
-if not TYPE_CHECKING:  # a type checker would take every name for one of weldcal
-
-    def __getattr__(name: str) -> object:
-        if name == "__version__":
-            from importlib.metadata import PackageNotFoundError, version
-
-            try:
-                return version("weldcal")
-            except PackageNotFoundError:
-                raise AttributeError("weldcal is not installed, so its version is not known") from None
-        if name not in __all__:
-            raise AttributeError(f"module 'weldcal' has no attribute '{name}'")
-        from weldcal.tools import api
-
-        return getattr(api, name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})

@@ -1,5 +1,7 @@
-"""Calibrates a scanner beside the robot from flange observations, step by step: for `weldcal calibrate` and the live
-job."""
+"""Calibrates a scanner beside the robot from flange observations, step by step.
+
+For `weldcal calibrate` and the live job.
+"""
 
 from __future__ import annotations
 
@@ -66,9 +68,11 @@ class Steps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
-    """The estimate and the n ``observations`` with all corrections applied; the verdict on the scanner (None: not
-    asked, or too few scans), the refinement (None: not asked), and ``warnings``, such as of a TCP that seems to be set.
-    ``X_rigid``: X_BC from the scans as they are."""
+    """The estimate and the n ``observations`` with all corrections applied.
+
+    The verdict on the scanner (None: not asked, or too few scans), the refinement (None: not asked), and ``warnings``,
+    such as of a TCP that seems to be set. ``X_rigid``: X_BC from the scans as they are.
+    """
 
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]
@@ -126,8 +130,9 @@ def calibrate(
 
 
 def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Calibration:
-    """A calibration without a refinement, refined as ``steps`` say; ``observations`` (n) are those it was made from, as
-    measured.
+    """A calibration without a refinement, refined as ``steps`` say.
+
+    ``observations`` (n) are those it was made from, as measured.
 
     It stays as it is, but for nested held-out errors, where that does not help. Raises TooFewPoses and InputError as
     `calibrate` does.
@@ -140,8 +145,10 @@ def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps
 def _estimate_consistent(
     observations: tuple[Observation, ...], steps: Steps
 ) -> tuple[CalibrationEstimate, ScannerVerdict | None, RigidTransform, tuple[str, ...]]:
-    """The estimate, the verdict on the scanner, X_BC from the scans as they are, and a sentence where the poses look as
-    if a TCP were set."""
+    """Estimate X_BC and judge the scanner, with a sentence where the poses look as if a TCP were set.
+
+    Returns the estimate, the verdict on the scanner, X_BC from the scans as they are, and the sentences.
+    """
     config = SolveConfig(seed=steps.seed, allow_coplanar=steps.coplanar)
     change = find_change(observations)
     try:
@@ -210,9 +217,12 @@ def _part(observations: tuple[Observation, ...]) -> dict[str, object]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Refined:
-    """What became of it: estimate and observations; the field, or the text of the kinematics file, the link transforms
-    (n, 4, 4) in it, the scanner correction that goes with them and the document of the errors, where one was accepted;
-    the sentence that says so or why not; ``numbers`` for the JSON object."""
+    """What became of it: estimate and observations.
+
+    The field, or the text of the kinematics file, the link transforms (n, 4, 4) in it, the scanner correction that goes
+    with them and the document of the errors, where one was accepted; the sentence that says so or why not; ``numbers``
+    for the JSON object.
+    """
 
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]

@@ -104,7 +104,7 @@ def _ur(
     designation: str = ISO_50,
     **sources: str,
 ) -> Robot:
-    """A robot of Universal Robots: payload (kg), reach (m) and repeatability (m) from ``sheet`` but for what ``sources``
+    """A robot of Universal Robots: payload (kg), reach and repeatability (m) from ``sheet`` but for what ``sources``
     names; ``mesh`` shows the dowel hole at -y of the tool frame."""
     payload, reach, repeatability = numbers
     name = model.lower()
@@ -148,7 +148,8 @@ def _franka(name: str, title: str, **sources: str) -> Robot:
         inverse=NUMERIC,
         sources=sources
         | {
-            "kinematics": "franka_description, robots/fer/kinematics.yaml; FCI documentation, Denavit-Hartenberg parameters",
+            "kinematics": "franka_description, robots/fer/kinematics.yaml; FCI documentation, Denavit-Hartenberg"
+            " parameters",
             "joint limits": "FCI documentation, Robot and interface specifications",
             "TCP": "libfranka, RobotState; franka_ros, franka_model_interface.h",
         },
@@ -181,7 +182,8 @@ ROBOTS: dict[str, Robot] = {
             "UR10e Technical Specification, May 2025",
             "ur10e",
             flange="User Manual UR10e (SW 5.19), 8.7.5 Securing Tool",
-            payload="UR10e Technical Specification, May 2025; 10 kg if the label says so (online manual, Maximum Payload)",
+            payload="UR10e Technical Specification, May 2025; 10 kg if the label says so (online manual, Maximum"
+            " Payload)",
         ),
         _ur(
             "UR12e",
@@ -189,7 +191,8 @@ ROBOTS: dict[str, Robot] = {
             _MODELS,
             "ur10e",
             flange=_HUB,
-            repeatability="UR10e Technical Specification: by Universal_Robots_ROS2_Description, config/ur12e, the same arm",
+            repeatability="UR10e Technical Specification: by Universal_Robots_ROS2_Description, config/ur12e, the same"
+            " arm",
         ),
         _ur("UR16e", (16.0, 0.900, 5e-5), "UR16e Technical Specification", "ur10e", flange=_HUB),
         _ur(

@@ -168,8 +168,7 @@ def _begin_process() -> None:
 
 
 def before_other_programs(thread: int = 0) -> None:
-    """Give a thread (0: the caller's) a larger share of the processor than other programs have, where the system allows
-    it."""
+    """Give a thread (0: the caller's) more of the processor than other programs have, where the system allows it."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, thread, NICE)
 

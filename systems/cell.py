@@ -1,6 +1,7 @@
 """Builds the cell Diagram of a scenario: the station, the spine shared by all jobs, and the scenario's job."""
 
 import dataclasses as dc
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -9,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
+from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.job import AddedJob, Job, job_of
@@ -22,7 +24,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.viewer.cameras import Views, add_cameras
 from weldcal.systems.viewer.live import LiveView, add_live_view
-from weldcal.systems.wiring import Wiring
+from weldcal.systems.wiring import Replacement, Wiring
 
 LOG_PERIOD_S = 0.008  # a row per servo tick
 
@@ -35,7 +37,9 @@ class Cell(Generic[JobOf]):
 
     The caller that builds a cell must close its station.
 
-    `logs`: the sinks of the logged values by name; in the Diagram the sink of NAME is called `log_NAME`.
+    `diagram` exports the station's output ports under their names, those of the job that JobPorts lists under theirs,
+    and `job` (JobCommand), `state` and `process_on` (1). `logs`: the sinks of the logged values by name; in the Diagram
+    the sink of NAME is called `log_NAME`.
     """
 
     diagram: Diagram
@@ -65,6 +69,7 @@ def build_cell(
     open_sink: OpenSink | None = None,
     operator: Operator | None = None,
     live: LiveView | None = None,
+    replace: Mapping[str, Replacement] | None = None,
 ) -> Cell[Any]:
     """Build the cell of a scenario. The caller must close its station.
 
@@ -78,9 +83,11 @@ def build_cell(
         open_sink: opens the sink that takes what enters and leaves the cell; None: nothing is recorded.
         operator: who may hold and end the run; None: a new one, the cell's `operator`.
         live: takes what the dashboard shows; None: no dashboard.
+        replace: makes systems that replace systems of the job, by name; each gets that system and the station.
 
     Raises:
-        InputError, UnreachableScanner: the scenario cannot be run; nothing has been written or moved.
+        InputError, UnreachableScanner: the scenario cannot be run, or the job has no system of a name in `replace`;
+            nothing has been written or moved.
     """
     job = job_of(scenario)
     station = make_station(scenario, seed, robot, job.set_up_world, played)
@@ -97,6 +104,7 @@ def build_cell(
             seed=seed,
             meshcat=meshcat,
             operator=operator if played is None else None,
+            replace=replace or {},
         )
         cell = _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink, live)
         return dc.replace(cell, operator=operator)
@@ -112,8 +120,13 @@ def _build(
     builder.AddSystem(station.diagram)
     arms = [(FIRST, station.arm)] + ([] if station.second is None else [(SECOND, station.second)])
     error = job.position_error(scenario, station.arm, wiring.seed)
-    spine = add_spine(wiring, arms, job.move_speed, job.move_acceleration, error)
+    # what limits and stops the arm cannot be replaced
+    spine = add_spine(dc.replace(wiring, replace={}), arms, job.move_speed, job.move_acceleration, error)
+    shared = {system.get_name() for system in builder.GetSystems()}
     added = job.add(wiring, spine, plan)
+    names = {system.get_name() for system in builder.GetSystems()} - shared
+    if unknown := sorted(set(wiring.replace) - names):
+        raise InputError(f"This job has no system '{unknown[0]}' to replace. It has {', '.join(sorted(names))}.")
     spine.connect(added.ports)
     if open_sink is not None:
         noted.note = add_recorder(wiring, added.ports.results, open_sink)
@@ -123,12 +136,19 @@ def _build(
         add_cameras(wiring, added.ports, added.view(), Views() if live is None else live.views)
         period_s = 1.0 / scenario.visualization.recording_fps
         params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period_s)
-        visualizer = builder.AddSystem(MeshcatVisualizer(wiring.meshcat, params))
-        visualizer.set_name("meshcat_visualizer")
+        visualizer = builder.AddNamedSystem("meshcat_visualizer", MeshcatVisualizer(wiring.meshcat, params))
         builder.Connect(wiring.out("query_object"), visualizer.query_object_input_port())
     logs = {name: LogVectorOutput(port, builder, LOG_PERIOD_S) for name, port in added.ports.logged.items()}
     for name, sink in logs.items():
         sink.set_name(f"log_{name}")
+    ports = {
+        port.get_name(): port
+        for port in map(station.diagram.get_output_port, range(station.diagram.num_output_ports()))
+    }
+    own = added.ports
+    ports |= {**own.logged, **own.shown, **own.results, "job": own.commands[0], "state": own.state}
+    for name, port in ports.items():
+        builder.ExportOutput(port, name)
     diagram = builder.Build()
     diagram.set_name("cell")
     return Cell(diagram, station, scenario, added, logs)

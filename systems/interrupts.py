@@ -1,5 +1,7 @@
-"""Answers Ctrl-C and SIGTERM from the start of the program to its end: one sentence, one exit code, no traceback, no
-process left."""
+"""Answers Ctrl-C and SIGTERM from the start of the program to its end.
+
+One sentence, one exit code, no traceback, no process left.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +57,10 @@ def received() -> bool:
 
 @contextmanager
 def work() -> Iterator[None]:
-    """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed
-    first."""
+    """The work of a command: a signal raises KeyboardInterrupt within the block.
+
+    After it, the outcome is printed first.
+    """
     _Now.time = _WORK
     try:
         yield

@@ -30,8 +30,10 @@ DECLARATIONS = (
 
 
 def without_owner(callback: Any) -> Any:
-    """The callback with a weak reference to the object whose method it is (a `partial` of a method too); any other as
-    it is."""
+    """The callback with a weak reference to the object whose method it is (a `partial` of a method too).
+
+    Any other as it is.
+    """
     if isinstance(callback, MethodType):
         return _of_a_reference(callback.__func__, ref(callback.__self__))
     if isinstance(callback, partial):

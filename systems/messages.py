@@ -81,8 +81,9 @@ class ProfileScan(Message):
 
 @dataclass(frozen=True, eq=False)
 class TorchTouch(Message):
-    """The newest touch: its number, its start time, whether the contact persists, and the joints (6,) rad that its
-    sensor read at its start; None where the sensor reads none, and those at `time` count.
+    """The newest touch: its number, its start, whether it persists, and the joints (6,) rad read at its start.
+
+    None where the sensor reads no joints, and those at `time` count.
     """
 
     sequence: int = 0
@@ -158,9 +159,11 @@ class VerificationResult(Message):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Refinement(Message):
-    """What became of the refinement of a live calibration: the arm with corrected kinematics or the local field,
-    where one is applied; the text of the kinematics file, the stated errors of the arm, and the JSON object of
-    `calibrate`."""
+    """What became of the refinement of a live calibration.
+
+    The arm with corrected kinematics or the local field, where one is applied; the text of the kinematics file, the
+    stated errors of the arm, and the JSON object of `calibrate`.
+    """
 
     kind: str
     sentence: str
@@ -181,14 +184,12 @@ class CalibrationStatus(Message):
     observations: tuple[Observation, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     estimate: CalibrationEstimate | None = None
-    predicted_error_m: float = (
-        np.inf
-    )  # expected error of a point at the work point, from the estimate's own covariance and noise
+    # expected error of a point at the work point, from the estimate's own covariance and noise
+    predicted_error_m: float = np.inf
     verification_cloud: Verification | None = None  # P_v of Algorithm 1
     algorithm_1: Algorithm1State | None = None
-    history: tuple[
-        tuple[int, float, float, float], ...
-    ] = ()  # scans, predicted error, held-out median, Algorithm 1's figure; m
+    # scans, predicted error, held-out median, Algorithm 1's figure; m
+    history: tuple[tuple[int, float, float, float], ...] = ()
     verifications: tuple[VerificationResult, ...] = ()
     done: bool = False
     message: str = ""
@@ -227,8 +228,7 @@ class ScanView(Message):
 
 @dataclass(frozen=True, eq=False)
 class SeamRecord(Message):
-    """One plan: the number of its seam, how its parts stand to each other, and the stretches (from, to) m that are not
-    welded."""
+    """One plan: its seam's number, how its parts lie to each other, and the stretches (from, to) m left unwelded."""
 
     seam: int
     fit_up: FitUp | None = None
@@ -237,8 +237,10 @@ class SeamRecord(Message):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
-    """The SeamPlanner's result for the workpiece scan, or for several; before the last one it holds the `views` so
-    far."""
+    """The SeamPlanner's result for the workpiece scan, or for several.
+
+    Before the last one it holds the `views` so far.
+    """
 
     sequence: int = 0
     views: tuple[ScanView, ...] = ()
@@ -261,14 +263,15 @@ class PlannedSeam(Message):
     # torch at one place
     arm_sigma_m: float = np.nan
     arm_turn_rad: float = np.nan
-    lean_rad: float = (
-        0.0  # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
-    )
+    # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
+    lean_rad: float = 0.0
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:
-    """The arm with refined kinematics of a `calibration_status` port; the given one where the port is open or has
-    none."""
+    """The arm with refined kinematics of a `calibration_status` port.
+
+    The given one where the port is open or has none.
+    """
     if not port.HasValue(context):
         return arm
     status: CalibrationStatus = port.Eval(context)

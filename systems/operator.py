@@ -1,5 +1,7 @@
-"""What an operator asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D
-view."""
+"""What an operator asks of a run: to hold, to go on, to end, to keep a pace.
+
+From the terminal, the dashboard or the 3D view.
+"""
 
 import sys
 import threading

@@ -26,8 +26,9 @@ TRIES = 3  # a single long pause, as of a disk, says nothing about the run
 
 
 def take_priority() -> None:
-    """Give this thread, and those that it starts later, real-time priority; where the system refuses it, the highest
-    ordinary priority that it allows.
+    """Give this thread, and those that it starts later, real-time priority.
+
+    Where the system refuses it, the highest ordinary priority that it allows.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(LOOP_PRIORITY))
@@ -95,8 +96,7 @@ def real_time_priority() -> Iterator[Callable[[bool], None]]:
 
 @contextmanager
 def short_turns() -> Iterator[None]:
-    """Let other threads of the interpreter hold its lock for at most SWITCH_S at a time while the control loop wants
-    it."""
+    """Let other threads hold the interpreter's lock for at most SWITCH_S while the control loop wants it."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -111,8 +111,10 @@ class HostTooLate(WeldcalError):
 
 @dataclass(frozen=True)
 class HostTiming:
-    """Wake-ups that were asked for every TICK_S: how many, the share that came LATE_MS late or later, and the
-    latest."""
+    """Wake-ups that were asked for every TICK_S.
+
+    How many, the share that came LATE_MS late or later, and the latest.
+    """
 
     wake_ups: int
     late_percent: float

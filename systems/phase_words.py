@@ -92,7 +92,9 @@ PROFILER_STEPS = {
 
 
 def phase_words(phase: str, detail: str = "") -> str:
-    """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is
-    written."""
+    """A phase in words, with a detail after a comma.
+
+    A phase that is not listed (of an installed job) as it is written.
+    """
     words = TEXT.get(phase) or OTHERS.get(phase) or phase.replace("_", " ")
     return f"{words}, {detail}" if detail else words

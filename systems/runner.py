@@ -10,7 +10,7 @@ from typing import Generic
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
@@ -44,8 +44,7 @@ def no_progress(stage: str, fraction: float) -> None:
 
 @dataclass(kw_only=True)
 class Run(Generic[JobOf]):
-    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase
-    began.
+    """One run of a cell: final root context, scans by label, and (simulated, wall) seconds at each phase's start.
 
     `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
     None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before
@@ -141,6 +140,7 @@ def run_cell(
     meshcat: Meshcat | None = None,
     realtime: bool = False,
     ended: Callable[[Run[JobOf]], None] = _nothing,
+    diagram: Diagram | None = None,
 ) -> Run[JobOf]:
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
@@ -151,12 +151,13 @@ def run_cell(
     The cell's `operator` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
     that the job goes on along the same path when the operator says so. During a weld the process is turned off first
     and the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
-    recording is shown.
+    recording is shown. `diagram`: the Diagram that contains the cell's; None: the cell's own.
 
     Raises:
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.
     """
-    simulator, station = Simulator(cell.diagram), cell.station
+    whole = cell.diagram if diagram is None else diagram
+    simulator, station = Simulator(whole), cell.station
     run = Run(cell=cell, simulator=simulator, clock=station.robot.clock)
     if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
@@ -203,7 +204,7 @@ def run_cell(
         if command.finished:
             finished_at = min(finished_at, root.get_time())
             if _at_rest(cell, root) or root.get_time() - finished_at > COMES_TO_REST_S:
-                return EventStatus.ReachedTermination(cell.diagram, command.phase)
+                return EventStatus.ReachedTermination(whole, command.phase)
         return EventStatus.DidNothing()
 
     simulator.set_monitor(watch)
@@ -267,7 +268,8 @@ def _stand(run: Run[JobOf], progress: Progress) -> None:
 
 def _process_on(cell: Cell[JobOf], root: Context) -> bool:
     """Whether the process (the torch) is enabled."""
-    return bool(cell.diagram.GetOutputPort("process_on").Eval(root)[0] > 0.5)
+    context = cell.diagram.GetMyContextFromRoot(root)
+    return bool(cell.diagram.GetOutputPort("process_on").Eval(context)[0] > 0.5)
 
 
 def _commanded(cell: Cell[JobOf], root: Context) -> bool:

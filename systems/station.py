@@ -1,5 +1,7 @@
-"""Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or
-simulated."""
+"""Builds the station: arms, sensors and tools with fixed ports.
+
+The scenario's driver configs select real or simulated.
+"""
 
 import dataclasses as dc
 import inspect
@@ -220,10 +222,9 @@ def _make_station(
     world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
         setup = WorldSetup() if set_up_world is None else set_up_world(scenario, rng, real, X_BP)
-        true_arm, true_second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
-        if true_second is not None:
-            of_second = scenario.robot_2.true_arm(true_second.arm, true_second.q_start, rng)
-            true_second = dc.replace(true_second, arm=of_second)
+        true_arm, second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
+        if second is not None:
+            second = dc.replace(second, arm=scenario.robot_2.true_arm(second.arm, second.q_start, rng))
         world = build_world(
             builder,
             true_arm,
@@ -233,13 +234,8 @@ def _make_station(
             table=table_in_base(scenario),
             workpiece=real,
             X_BP=X_BP,
-            fittings=setup.fittings,
-            second=true_second,
-            foot=setup.foot,
-            profiler=setup.profiler,
-            time_step_s=setup.time_step_s,
+            setup=dc.replace(setup, second=second),
             surroundings=surroundings,
-            contacts_read=setup.contacts_read,
         )
         build.parts = (world, *setup.parts)
     X_LC = None
@@ -268,7 +264,6 @@ def _make_station(
     _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
     diagram.set_name("station")
-    second = None if setup.second is None else setup.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background: Background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
     if played is not None:
@@ -280,7 +275,7 @@ def _make_station(
         cad=cad,
         truth=truth,
         world=world,
-        second=second,
+        second=None if setup.second is None else setup.second.arm,
         background=background,
         devices=tuple(opened),
         surroundings=surroundings,
@@ -288,8 +283,10 @@ def _make_station(
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
-    """Apply a single-arm driver to the second arm: it gets a world with this arm as its arm, and its ports are
-    renamed."""
+    """Apply a single-arm driver to the second arm.
+
+    It gets a world with this arm as its arm, and its ports are renamed.
+    """
     world = build.require(SimulatedWorld)
     assert world.second is not None
     own = dc.replace(
@@ -407,16 +404,13 @@ def _export(
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")
         return
-    source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth)))
-    source.set_name("truth")
+    source = builder.AddNamedSystem("truth", ConstantValueSource(AbstractValue.Make(truth)))
     builder.ExportOutput(source.get_output_port(), "cheat.truth")
     if truth.X_BC is not None:
-        camera = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth.X_BC)))
-        camera.set_name("true_X_BC")
+        camera = builder.AddNamedSystem("true_X_BC", ConstantValueSource(AbstractValue.Make(truth.X_BC)))
         builder.ExportOutput(camera.get_output_port(), "cheat.X_BC")
     if build.tool is not None:
-        cheat = builder.AddSystem(CheatPoses(world, build.tool))
-        cheat.set_name("cheat_poses")
+        cheat = builder.AddNamedSystem("cheat_poses", CheatPoses(world, build.tool))
         builder.Connect(world.plant.get_body_poses_output_port(), cheat.GetInputPort("body_poses"))
         builder.ExportOutput(cheat.GetOutputPort("contact"), "cheat.contact")
         builder.ExportOutput(cheat.GetOutputPort("torch"), "cheat.torch")

@@ -1,5 +1,7 @@
-"""Paces the Diagram by the wall clock: waits while it is ahead, slows the path while it is late, counts how late each
-tick was."""
+"""Paces the Diagram by the wall clock.
+
+Waits while it is ahead, slows the path while it is late, counts how late each tick was.
+"""
 
 import time
 from collections import deque
@@ -10,8 +12,9 @@ KEPT = 8192  # corners of the course: 16 s of a rate that changes with every tic
 
 
 class LostTime:
-    """The course of the time lost over a clock, both s, as a line through corners: flat while the Diagram keeps its
-    pace.
+    """The course of the time lost over a clock, both s, as a line through corners.
+
+    Flat while the Diagram keeps its pace.
 
     A device with a clock of its own goes on while the Diagram stands. What the Diagram knows by its own time, such as
     where the arm was, is paired with the device's time less the time lost by then.
@@ -33,8 +36,10 @@ class LostTime:
         corners.append((clock_s, total))
 
     def at(self, clock_s: float) -> float:
-        """The time lost by a time of the clock, s; before the first corner that is kept as at it, after the newest as
-        at that."""
+        """The time lost by a time of the clock, s.
+
+        Before the first corner that is kept as at it, after the newest as at that.
+        """
         later: tuple[float, float] | None = None
         for t, lost in reversed(self._corners):
             if t <= clock_s:
@@ -207,8 +212,7 @@ class WallClock:
         return found if found - now <= LATE_S else now
 
     def lost_by(self, clock_s: float) -> float:
-        """Seconds by which the Diagram had fallen behind the clock that it waits for at an earlier time of it, since it
-        began."""
+        """Seconds by which the Diagram had fallen behind its clock at an earlier time of it, since it began."""
         return self._course.at(clock_s)
 
     def _stand_until(self, clock_s: float) -> None:
@@ -218,8 +222,10 @@ class WallClock:
         self._due = clock_s
 
     def overdue_s(self, diagram_time: float) -> float:
-        """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has
-        waited."""
+        """How late (s of robot time) a velocity of this time of the Diagram would leave it now.
+
+        0 before the clock has waited.
+        """
         if self._at is None:
             return 0.0
         due = self._due + (diagram_time - self._at) / (self.pace * self.rate)
@@ -271,8 +277,9 @@ class WallClock:
 
 
 class PictureWait:
-    """Gives a loaded computer time to take a late picture where the robot waits for its cell; a camera that has stopped
-    gets little of it.
+    """Gives a loaded computer time to take a late picture where the robot waits for its cell.
+
+    A camera that has stopped gets little of it.
 
     Picture and Diagram are late by the same computer, and only the Diagram is waited for by the robot: without this the
     servo misses pictures that are on their way.
@@ -283,8 +290,7 @@ class PictureWait:
         self._waited_s = 0.0
 
     def wait(self, age_s: float) -> None:
-        """Wait a little, once in a tick, where the newest picture was taken more than PICTURE_DUE_S ago (s of the
-        Diagram)."""
+        """Wait a little, once in a tick, where the newest picture is older than PICTURE_DUE_S (s of the Diagram)."""
         if age_s <= PICTURE_DUE_S:
             self._waited_s = 0.0
         elif self._waited_s < PICTURE_PATIENCE_S:

@@ -1,6 +1,7 @@
 """The main uses of weldcal as Python functions; `import weldcal` has all of them."""
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.wiring import Replacement
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import run_procedure
 from weldcal.tools.commands.hand_eye import solve_arrays
@@ -184,27 +186,45 @@ def hand_eye(
     return solve_arrays(A, B, mounting_name(mounting), robot_form, camera_form)
 
 
-def build_cell(scenario: Scenario | str, seed: int = 0, meshcat: Meshcat | None = None) -> Cell[Any]:
+def build_cell(
+    scenario: Scenario | str,
+    seed: int = 0,
+    meshcat: Meshcat | None = None,
+    *,
+    replace: Mapping[str, Replacement] | None = None,
+) -> Cell[Any]:
     """Build the Drake Diagram of a scenario (or of its name or path); close its `.station` after use.
 
     Args:
         meshcat: viewer of the cell; None: no viewer.
+        replace: makes systems that replace systems of the job, by name; each gets that system and the station.
 
     Returns:
         `.diagram`; `.plant` and `.scene_graph` of its simulation, finalized; `.logs`, the VectorLogSinks by name.
 
     Raises:
-        InputError, UnreachableScanner: the scenario cannot be run.
+        InputError, UnreachableScanner: the scenario cannot be run, or `replace` does not fit the job.
     """
-    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed, meshcat)
+    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed, meshcat, replace=replace)
 
 
-def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True) -> dict[str, object]:
+def run(
+    scenario: str,
+    out: str | Path,
+    seed: int = 0,
+    *,
+    recording: bool = True,
+    replace: Mapping[str, Replacement] | None = None,
+) -> dict[str, object]:
     """Run the job of a scenario (name or path) and write its result folder, as `weldcal demo` does; returns its
     summary.
+
+    Args:
+        recording: write recording.html.
+        replace: see build_cell.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: the scenario cannot be run; nothing has been written or moved.
     """
-    options = RunOptions(scenario=scenario, out=Path(out), seed=seed, recording=recording)
+    options = RunOptions(scenario=scenario, out=Path(out), seed=seed, recording=recording, replace=replace)
     return dict(run_procedure(options, lambda stage, fraction: None).summary())

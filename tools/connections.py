@@ -1,5 +1,4 @@
-"""Limits and timeouts of every port that weldcal opens: strangers take no descriptors, threads or time from what the
-port serves."""
+"""Limit connections and timeouts of every port that weldcal opens, so that strangers take no resources."""
 
 import os
 import resource
@@ -113,8 +112,7 @@ class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
 
 
 def guard(view: Any) -> None:
-    """Limit the connections of a Meshcat, whose server in this process has no limit, in a thread, for as long as it
-    lives.
+    """Limit the connections of a Meshcat, whose server has no limit, by a thread for as long as it lives.
 
     Of more than VIEWS connections those are ended that have sent least.
     """

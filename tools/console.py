@@ -80,8 +80,7 @@ WHOLE = ("p[", "weldcal ", "[[")
 
 
 def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
-    """The lines of one row: the name in a column of so many characters, then the text, wrapped between words to a
-    width."""
+    """Lay out one row: the name in a column of so many characters, then the text, wrapped to a width."""
     indent = " " * (2 + column + 2)
     found: list[str] = []
     for line in text.splitlines():
@@ -160,8 +159,7 @@ def _short(value: object) -> str:
 
 
 def emit_text(text: str) -> None:
-    """Writes a text on stdout; lines that are wider than the terminal are wrapped between words, below their second
-    column."""
+    """Write a text on stdout; wide lines are wrapped between words, below their second column."""
     wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
     for line in text.splitlines():
         column = re.match(r"\S.{0,14}?\s{2,}", line)

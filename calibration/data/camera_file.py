@@ -1,5 +1,7 @@
-"""Read a camera's matrix and distortion from the files that ROS, OpenCV, Kalibr, EuRoC, ViSP, Open3D, BOP and RealSense
-users have."""
+"""Read a camera's matrix and distortion from the files of common tools.
+
+They are those of ROS, OpenCV, Kalibr, EuRoC, ViSP, Open3D, BOP and RealSense.
+"""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Read dataset.yaml and CSV tables, and check them: rows, numbers, quaternions, units, clouds that repeat."""
+"""Read dataset.yaml and CSV tables, and check them: rows, numbers, quaternions and units; hashes of files."""
 
 import csv
 import math
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.cloud_files.body import VIEWPOINTS, measured
 from weldcal.calibration.data.cloud_files.depth import checked_intrinsics
@@ -79,9 +79,11 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
 
 
 def cut_off(path: Path) -> str | None:
-    """A sentence where a CSV file seems to end within its last row, None else: that row has fewer cells than the
-    header, or no line break follows it and its last number is shorter than all others of its column. Raises what
-    read_rows raises."""
+    """A sentence where a CSV file seems to end within its last row, None else.
+
+    That row has fewer cells than the header, or no line break follows it and its last number is shorter than all others
+    of its column. Raises what read_rows raises.
+    """
     table = [values for _, values in _cells(path)]
     rows = [row for row in table[1:] if any(row)]
     if not rows:
@@ -278,7 +280,7 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
         other = "mm" if unit == "m" else "m"
         raise CloudError(
             f"The points of {name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
-            "units in dataset.yaml."
+            f"units in dataset.yaml to 'clouds: {other}'."
         )
     return points
 
@@ -387,7 +389,7 @@ def check_reach(points: Array, path: Path, unit: str, of: str = "robot's base") 
         other = "mm" if unit == "m" else "m"
         raise DatasetError(
             f"The positions in '{path.name}' lie {reach:.4g} m from the {of}, which is out of reach: they look "
-            f"like {other}; correct units in dataset.yaml."
+            f"like {other}; correct units in dataset.yaml to '{'clouds' if of == 'camera' else 'poses'}: {other}'."
         )
 
 
@@ -397,3 +399,21 @@ def digest(path: Path) -> str:
         return sha256(path)
     except InputError as e:
         raise DatasetError(str(e)) from e
+
+
+class Recorded:
+    """What a recording's header states of the calibration's poses."""
+
+    header: DatasetHeader
+
+    @property
+    def X_FR(self) -> RigidTransform:
+        """Pose of the calibration feature in the flange frame."""
+        f = self.header.feature_in_flange
+        return RigidTransform(unit_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
+
+    @property
+    def X_BC_guess(self) -> RigidTransform | None:
+        """The header's guess of the scanner's pose; None without one."""
+        g = self.header.scanner_guess
+        return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)

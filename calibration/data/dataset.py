@@ -17,6 +17,7 @@ from weldcal.calibration.data.checks import (
     CONFIGURATIONS,
     REACH_M,
     UNITS,
+    Recorded,
     check_reach,
     cloud_form,
     digest,
@@ -44,6 +45,7 @@ from weldcal.calibration.data.poses.source import (
     read_poses,
 )
 from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256
@@ -55,8 +57,7 @@ SECOND_JOINTS = tuple(f"second_q{k}" for k in range(1, 7))
 
 @dataclass(frozen=True)
 class Pair:
-    """A centre found by other means: camera point (3,) m and the robot's pose of the feature (rotation identity where
-    not given)."""
+    """A centre (3,) m of C found by other means, and the feature's pose (rotation identity where not given)."""
 
     id: str
     X_BR: RigidTransform
@@ -65,9 +66,12 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Dataset:
-    """A dataset, checked. ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason).
-    ``recorded`` holds the clouds, in metres, that stand in no file of their own; ``notes`` say what was recognised."""
+class Dataset(Recorded):
+    """A dataset, checked.
+
+    ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason). ``recorded`` holds the
+    clouds, in metres, that stand in no file of their own; ``notes`` say what was recognised.
+    """
 
     folder: Path
     header: DatasetHeader
@@ -84,15 +88,14 @@ class Dataset:
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
         """The dataset with its poses in another of its readings."""
-        poses = {id: _rigid(X) for id, X in zip(self.poses, reading.X, strict=True)}
+        poses = {id: as_transform(X) for id, X in zip(self.poses, reading.X, strict=True)}
         others = tuple(one for one in self.readings if one.form != reading.form)
         return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
 
     def between(self, ids: str) -> Self:
-        """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its
-        order.
+        """Return the dataset from the scan FROM to the scan TO of "FROM:TO", ids of which either may be left out.
 
-        Raises DatasetError where there is no colon, an id is not in the dataset, or FROM stands after TO.
+        Raises DatasetError where there is no colon, an id is not in the dataset, or FROM comes after TO.
         """
         first, colon, last = (part.strip() for part in ids.partition(":"))
         known = [p.id for p in self.pairs] or list(self.clouds)
@@ -113,22 +116,10 @@ class Dataset:
             pairs=tuple(p for p in self.pairs if p.id in kept),
         )
 
-    @property
-    def X_FR(self) -> RigidTransform:
-        """Pose of the calibration feature in the flange frame."""
-        f = self.header.feature_in_flange
-        return RigidTransform(unit_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
-
     def guess(self, id: str) -> RigidTransform | None:
         """Pose X_CR of the feature in the camera frame from the header's guess of X_BC; None without a guess."""
         X_BC = self.X_BC_guess
         return None if X_BC is None else X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
-
-    @property
-    def X_BC_guess(self) -> RigidTransform | None:
-        """The header's guess of X_BC; None without one."""
-        g = self.header.scanner_guess
-        return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
 
     def joints(self, names: tuple[str, ...] = JOINTS) -> dict[str, Array]:
         """Joint angles (6,) rad by id, of poses.csv; empty where it has none.
@@ -155,8 +146,9 @@ class Dataset:
 
 
 def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dataset:
-    """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv; or the poses in any form of
-    docs/datasets.md.
+    """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv.
+
+    Or the poses in any form of docs/datasets.md.
 
     Without dataset.yaml the scanner is taken as fixed beside the robot, and the units follow from the size of the
     numbers. ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be
@@ -270,7 +262,7 @@ def _recognised(
     X, unit = metric_poses(found, header.units.poses, form)
     ids, files, how = pair(found.ids, len(X), find_clouds(folder, source), found.source)
     check_reach(X[:, :3, 3], Path(found.source), unit)
-    poses = {id: _rigid(pose) for id, pose in zip(ids, X, strict=True)}
+    poses = {id: as_transform(pose) for id, pose in zip(ids, X, strict=True)}
     for path in source if isinstance(source, tuple) else (source,):
         hashes[path.relative_to(folder).as_posix()] = digest(path)
     clouds = {id: path for id, path in zip(ids, files, strict=True) if path is not None}
@@ -296,7 +288,7 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
         hashes[path.name] = digest(path)
     for id, points in recorded.items():
         hashes[f"clouds/{id}"] = hashlib.sha256(np.ascontiguousarray(points).tobytes()).hexdigest()
-    poses = {id: _rigid(pose) for id, pose in zip(found.ids, X, strict=True)}
+    poses = {id: as_transform(pose) for id, pose in zip(found.ids, X, strict=True)}
     clouds = {id: bag / id for id in found.ids}
     return Dataset(
         folder=folder,
@@ -366,10 +358,6 @@ def _camera_note(folder: Path, header: DatasetHeader, cloud: Path, hashes: dict[
     )
 
 
-def _rigid(X: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
-
-
 def save_dataset(
     folder: Path,
     header: DatasetHeader,
@@ -380,8 +368,9 @@ def save_dataset(
     joints: Mapping[str, Array] | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
 ) -> None:
-    """Record scans as a dataset folder that load_dataset reads back: X_BF and a cloud in metres ((N, 3) or (H, W, 3))
-    per id.
+    """Record scans as a dataset folder that load_dataset reads back.
+
+    X_BF and a cloud in metres ((N, 3) or (H, W, 3)) per id.
 
     ``times`` (s) adds the column `time`, ``joints`` (6,) or (12,) rad q1 to q6, and of a second arm second_q1 to
     second_q6; ``intrinsics`` writes organised clouds as depth maps. ``header.units`` is written as metres. Raises
@@ -446,9 +435,15 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
     spread_C = np.array([p.p_CR for p in pairs])
     a, b = (float(np.median(np.linalg.norm(s - np.median(s, axis=0), axis=1))) for s in (spread_B, spread_C))
     if min(a, b) > 0.0 and not 0.02 < a / b < 50.0:
+        robot_too_large, metres = a > b, (scale_base == 1.0, scale_camera == 1.0)
+        cure = (
+            ("poses: mm" if metres[0] else "clouds: m")
+            if robot_too_large
+            else ("clouds: mm" if metres[1] else "poses: m")
+        )
         raise DatasetError(
             f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
-            "millimetres; correct units in dataset.yaml."
+            f"millimetres; correct units in dataset.yaml to '{cure}'."
         )
     check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
     return tuple(pairs)
@@ -479,8 +474,10 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
 
 
 def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str], ...]:
-    """Scans identical to another one, with the reason: a copy would count twice and predict itself in
-    cross-validation."""
+    """Scans identical to another one, with the reason.
+
+    a copy would count twice and predict itself in cross-validation.
+    """
     first: dict[tuple[object, ...], str] = {}
     again = []
     for id, scan in scans.items():

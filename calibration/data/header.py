@@ -19,8 +19,10 @@ class Units:
 
 @dataclass
 class Feature:
-    """Pose of the flange-like feature in the flange frame: position m and quaternion wxyz; identity for a
-    bare flange."""
+    """Pose of the flange-like feature in the flange frame: position m and quaternion wxyz.
+
+    Identity for a bare flange.
+    """
 
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
@@ -28,8 +30,10 @@ class Feature:
 
 @dataclass
 class ScannerGuess:
-    """Approximate pose X_BC of the scanner: position m, quaternion wxyz, and the largest error of the feature it
-    causes, m."""
+    """Approximate pose X_BC of the scanner.
+
+    Position m, quaternion wxyz, and the largest error of the feature it causes, m.
+    """
 
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
@@ -38,8 +42,10 @@ class ScannerGuess:
 
 @dataclass
 class SecondRobot:
-    """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base: m,
-    quaternion wxyz."""
+    """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base.
+
+    m, quaternion wxyz.
+    """
 
     robot: str = "ur10e"
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -58,10 +64,12 @@ class DepthCamera:
 
 @dataclass(kw_only=True)
 class PoseForm:
-    """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml),
-    ``rotation`` (a notation by name), ``angles`` (rad or deg), ``frame`` (flange_in_base, or base_in_flange for the
-    inverse), ``tcp`` (the controller's TCP x,y,z,rx,ry,rz in m and rad where the poses are the TCP's), and of a ROS
-    recording the names of the frames and topics."""
+    """How the poses are written, where it is not x,y,z,qw,qx,qy,qz.
+
+    ``file`` (a file or folder beside dataset.yaml), ``rotation`` (a notation by name), ``angles`` (rad or deg),
+    ``frame`` (flange_in_base, or base_in_flange for the inverse), ``tcp`` (the controller's TCP x,y,z,rx,ry,rz in m and
+    rad where the poses are the TCP's), and of a ROS recording the names of the frames and topics.
+    """
 
     file: str = ""
     rotation: str = ""

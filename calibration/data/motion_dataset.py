@@ -13,13 +13,13 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.checks import (
     IN_HAND,
     UNITS,
+    Recorded,
     check_reach,
     digest,
     metric_cloud,
     read_header,
     read_rows,
     table_rows,
-    unit_quaternion,
 )
 from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, ending_of, find_cloud, save_cloud
 from weldcal.calibration.data.header import DatasetHeader, Units, without_cloud_form
@@ -41,8 +41,11 @@ _NEAR_S = 10.0  # arrivals so far from the stream are on another clock
 
 @dataclass(frozen=True, eq=False)
 class RobotStream:
-    """Robot stream as recorded, in ascending order of ``time`` (n,) s, the robot's clock: ``poses`` X_BF (n, 4, 4) m,
-    and the joint angles ``joints`` (n, J) rad that they were computed from, or None where the stream holds poses."""
+    """Robot stream as recorded, in ascending order of ``time`` (n,) s, the robot's clock.
+
+    ``poses`` X_BF (n, 4, 4) m, and the joint angles ``joints`` (n, J) rad that they were computed from, or None where
+    the stream holds poses.
+    """
 
     time: Array
     poses: Array
@@ -52,8 +55,10 @@ class RobotStream:
 
 @dataclass(frozen=True)
 class FrameTime:
-    """Times of one frame, s: ``arrival`` on the robot's clock, ``device`` on the scanner's own clock (None without
-    one)."""
+    """Times of one frame, s.
+
+    ``arrival`` on the robot's clock, ``device`` on the scanner's own clock (None without one).
+    """
 
     id: str
     arrival: float
@@ -61,7 +66,7 @@ class FrameTime:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionDataset:
+class MotionDataset(Recorded):
     """A recording in motion, checked.
 
     ``frames`` ascend by arrival and have a cloud each (``clouds``: id to file); ``refused`` lists (id, reason);
@@ -78,26 +83,9 @@ class MotionDataset:
     hashes: dict[str, str]
 
     @property
-    def X_FR(self) -> RigidTransform:
-        """Pose of the calibration feature in the flange frame."""
-        f = self.header.feature_in_flange
-        return RigidTransform(unit_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
-
-    @property
     def in_hand(self) -> bool:
         """Whether the scanner is on the flange and sees a fixed target."""
         return self.header.configuration == IN_HAND
-
-    @property
-    def X_BC_guess(self) -> RigidTransform | None:
-        """The header's guess of the scanner's pose, or None."""
-        g = self.header.scanner_guess
-        return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
-
-    @property
-    def has_device_times(self) -> bool:
-        """Whether every frame carries a time of the scanner's own clock."""
-        return all(f.device is not None for f in self.frames)
 
     def cloud(self, id: str) -> Array:
         """Points of one frame in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
@@ -213,8 +201,10 @@ def _write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[objec
 
 
 def read_stream(path: Path, *, robot: str = "", unit: str = "m") -> tuple[RobotStream, list[str]]:
-    """A robot's stream from a file alone, with poses in ``unit`` (m or mm) or joint angles of ``robot``, and sentences
-    about rows that were left out. Raises DatasetError, one sentence."""
+    """Read a robot's stream from a file alone, and sentences about rows that were left out.
+
+    Poses are in ``unit`` (m or mm), or joint angles of ``robot``. Raises DatasetError, one sentence.
+    """
     if unit not in UNITS:
         raise DatasetError(f"The unit '{unit}' is not known; write m or mm.")
     if not path.is_file():

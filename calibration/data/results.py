@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_document
-from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
-from weldcal.calibration.geometry.se3 import rotation_vector
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_from_document
+from weldcal.calibration.geometry.se3 import as_transform, rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import DocumentSection, read_document, shown
 from weldcal.models.errors import InputError
@@ -38,8 +39,10 @@ class PoseRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class IcpRecord:
-    """Algorithm 1's ICP figure at one verification pose: six numbers at the flange centre, and the components it does
-    not see."""
+    """Algorithm 1's ICP figure at one verification pose.
+
+    Six numbers at the flange centre, and the components it does not see.
+    """
 
     id: str
     method: str
@@ -57,7 +60,7 @@ class CalibrationResult:
     ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin; ``joint_covariance`` (6 +
     K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one; ``clock`` of the scanner and
     ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as they were
-    estimated, where the calibration was made in motion; With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and
+    estimated, where the calibration was made in motion. With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and
     ``target`` the centre (3,) m and normal (3,) of what was seen, in the base. ``axis_turn_deg`` how far the hole
     pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of what --refine
     local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
@@ -100,16 +103,23 @@ class CalibrationResult:
         """Name of the pose: X_BC, or X_FC of a scanner on the flange."""
         return "X_BC" if self.configuration == ON_BASE else "X_FC"
 
-    def correct(self, points_C: Array) -> Array:
-        """Correct measured points (..., 3) m of the camera frame for the scanner's own errors, as the pose expects
-        them.
+    def correct(self, points_C: ArrayLike) -> Array:
+        """Correct measured points of the camera frame for the scanner's own errors, as the pose expects them.
+
+        Args:
+            points_C: (N, 3), or organised (H, W, 3), in metres; or a point cloud of Open3D.
 
         Returns:
-            The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays
-            NaN.
+            The corrected points, m, in the same shape; the same points where the result has no `scanner_correction`.
+            NaN stays NaN.
+
+        Raises:
+            InputError: not three coordinates for each point.
         """
         correction = correction_from_document(self.scanner_correction)
-        points = np.asarray(points_C, dtype=float)
+        points = np.asarray(getattr(points_C, "points", points_C), dtype=float)
+        if points.ndim < 1 or points.shape[-1] != 3:
+            raise InputError(f"Points must be (N, 3) or (H, W, 3) in metres; these are {points.shape}.")
         return points if correction is None else correction.points(points)
 
 
@@ -126,9 +136,22 @@ def matrix4(X: RigidTransform) -> list[list[float]]:
     return [[float(v) for v in row] for row in X.GetAsMatrix4()]
 
 
+def pose_document(X: RigidTransform) -> dict[str, Any]:
+    """A pose as plain values: its matrix, position (m) and quaternion."""
+    q = X.rotation().ToQuaternion().wxyz()
+    return {"matrix": matrix4(X), "xyz": [float(v) for v in X.translation()], "wxyz": [float(v) for v in q]}
+
+
+def pose_of_document(section: DocumentSection, refusal: str) -> RigidTransform:
+    """The pose of a document's ``matrix``. Raises InputError with the sentence ``refusal`` where it is not rigid."""
+    M = section.array("matrix", 4, 4)
+    if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
+        raise InputError(refusal)
+    return as_transform(M)
+
+
 def save_result(result: CalibrationResult, folder: Path) -> Path:
     """Write ``calibration.yaml`` in ``folder``; returns its path."""
-    q = result.X_BC.rotation().ToQuaternion().wxyz()
     parent = "base" if result.configuration == ON_BASE else "flange"
     document = {
         "schema": 1,
@@ -137,45 +160,23 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         "flange": result.flange,
         "scanner": result.scanner,
         "configuration": result.configuration,
-        result.symbol: {
-            "matrix": matrix4(result.X_BC),
-            "xyz": [float(v) for v in result.X_BC.translation()],
-            "wxyz": [float(v) for v in q],
-        },
-        "covariance": {
-            "order": f"rotation (rad) then translation (m), on the {parent} side about the camera origin",
-            "matrix": [[float(v) for v in row] for row in result.covariance],
-        },
+        result.symbol: pose_document(result.X_BC),
+        "covariance": _matrix(
+            f"rotation (rad) then translation (m), on the {parent} side about the camera origin", result.covariance
+        ),
         **({} if result.target is None else {"target": target_document(result.target)}),
         "scanner_correction": result.scanner_correction,
-        "joint_covariance": (
-            None
-            if result.joint_covariance is None
-            else {
-                "order": (
-                    "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2,"
-                    " bend_per_m3"
-                ),
-                "matrix": [[float(v) for v in row] for row in result.joint_covariance],
-            }
+        "joint_covariance": _matrix(
+            "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2, bend_per_m3",
+            result.joint_covariance,
         ),
         "clock": None if result.clock is None else result.clock.document(),
-        "clock_covariance": (
-            None
-            if result.clock_covariance is None
-            else {
-                "order": (
-                    "as covariance, then offset (s), drift (s/s) and rolling time (s), as far as the clock has them"
-                ),
-                "matrix": [[float(v) for v in row] for row in result.clock_covariance],
-            }
+        "clock_covariance": _matrix(
+            "as covariance, then offset (s), drift (s/s) and rolling time (s), as far as the clock has them",
+            result.clock_covariance,
         ),
         "axis_turn_deg": None if result.axis_turn_deg is None else list(result.axis_turn_deg),
-        **({} if result.local_field is None else {"local_field": result.local_field}),
-        **({} if not result.kinematics_file else {"kinematics_file": result.kinematics_file}),
-        **({} if result.orientations is None else {"orientations": result.orientations}),
-        **({} if result.observed is None else {"observed": result.observed}),
-        **({} if result.arm_errors is None else {"arm_errors": result.arm_errors}),
+        **{key: value for key in _WHERE_KNOWN if (value := getattr(result, key)) not in (None, "")},
         "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
         "tilt_deg": result.tilt_deg,
         "sigma_position_mm": result.sigma_position_mm,
@@ -192,9 +193,32 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
     return path
 
 
+_WHERE_KNOWN = ("local_field", "kinematics_file", "orientations", "observed", "arm_errors")
+
+
+def _matrix(order: str, C: Array | None) -> dict[str, Any] | None:
+    return None if C is None else {"order": order, "matrix": [[float(v) for v in row] for row in C]}
+
+
 def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
     """A fixed target's centre (m) and normal in the base as plain values."""
     return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
+
+
+def load_correction(path: Path) -> ScannerCorrection | None:
+    """Read the scanner correction of any calibration.yaml (or the folder that holds it); None where it has none.
+
+    Raises InputError: the file is missing or no calibration, or its correction cannot be read.
+    """
+    path = Path(path)
+    path = path / RESULT_FILE if path.is_dir() else path
+    require_whole(path)
+    if not path.exists():
+        raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
+    document = read_document(path)
+    if not isinstance(document, dict) or not {"X_BC", "X_FC", "scanner_correction"} & set(document):
+        raise InputError(f"'{path}' is not a calibration result; give a folder written by 'weldcal calibrate'.")
+    return correction_from_document(document.get("scanner_correction"), path.name)
 
 
 def load_result(path: Path) -> CalibrationResult:
@@ -218,9 +242,8 @@ def load_result(path: Path) -> CalibrationResult:
     d = DocumentSection.of(path.name, document)
     if d.values["schema"] != 1:
         raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")
-    M = d.section("X_BC").array("matrix", 4, 4)
-    if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0:
-        raise InputError(f"The rotation in '{path.name}' is not orthonormal; the file was changed by hand.")
+    refusal = f"The rotation in '{path.name}' is not orthonormal; the file was changed by hand."
+    X_BC = pose_of_document(d.section("X_BC"), refusal)
     covariance = _covariance(d, "covariance", 6)
     correction_from_document(d.values.get("scanner_correction"), path.name)  # it can be read
     joint = None
@@ -231,7 +254,7 @@ def load_result(path: Path) -> CalibrationResult:
         joint = _covariance(d, "joint_covariance", size)
     turn = d.array("axis_turn_deg", 2) if d.has("axis_turn_deg") else None
     return CalibrationResult(
-        X_BC=RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3]),
+        X_BC=X_BC,
         covariance=covariance,
         held_out_mm={k: float("nan") if v is None else v for k, v in d.numbers("held_out_mm").items()},
         tilt_deg=d.numbers("tilt_deg"),
@@ -318,8 +341,10 @@ def _only(r: DocumentSection, kind: type) -> None:
 def export_urdf(
     X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame", note: str | None = None
 ) -> str:
-    """A xacro file for `xacro:include` into a robot that has the parent link: the child link on a fixed joint, one root
-    element."""
+    """A xacro file for `xacro:include` into a robot that has the parent link.
+
+    The child link on a fixed joint, one root element.
+    """
     roll, pitch, yaw = X_BC.rotation().ToRollPitchYaw().vector()
     x, y, z = X_BC.translation()
     # two hyphens may not stand in an XML comment
@@ -350,10 +375,8 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 
 def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
     """Where a user of the pose finds the scanner correction: the command and the Python call that apply it."""
-    return (
-        f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them, in Python"
-        f" weldcal.read_calibration({str(file)!r}).correct(points)."
-    )
+    call = f", in Python weldcal.read_calibration({str(file)!r}).correct(points)" if symbol == "X_BC" else ""
+    return f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them{call}."
 
 
 def correction_note(result: CalibrationResult, file: Path | str | None = None) -> str | None:
@@ -389,14 +412,13 @@ def result_parent(result: CalibrationResult) -> str:
 
 def export_json(result: CalibrationResult) -> str:
     """X_BC and covariance for other programs."""
-    qw, qx, qy, qz = _wxyz(result.X_BC)
     return json.dumps(
         {
             "parent": result_parent(result),
             "child": "scanner_optical_frame",
             result.symbol: matrix4(result.X_BC),
             "xyz": [float(v) for v in result.X_BC.translation()],
-            "quaternion_wxyz": [qw, qx, qy, qz],
+            "quaternion_wxyz": list(_wxyz(result.X_BC)),
             "covariance_rotation_translation": np.asarray(result.covariance).tolist(),
             "scanner_correction": result.scanner_correction,
             "note": correction_note(result),

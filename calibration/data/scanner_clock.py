@@ -37,8 +37,10 @@ class ScannerClock:
     reason: str = ""
 
     def capture(self, arrival: float, device: float | None = None, row: float = 0.0) -> float | None:
-        """Capture time (s) of a frame on the robot's clock, expected from its times; ``row`` is y/z of what is looked
-        at. None where the offset is not known, or the frame lacks the clock's time."""
+        """Capture time (s) of a frame on the robot's clock, expected from its times.
+
+        ``row`` is y/z of what is looked at. None where the offset is not known, or the frame lacks the clock's time.
+        """
         if self.offset_s is None or (self.kind == DEVICE and device is None):
             return None
         rolled = (self.rolling_s or 0.0) * row

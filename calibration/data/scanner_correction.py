@@ -25,8 +25,9 @@ _USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so m
 
 @dataclass(frozen=True)
 class ScannerCorrection:
-    """p_C corrected = p_C (scale + gx x + gy y + bends), with x and y (m) of the point as it was measured, camera
-    frame.
+    """Correct a point by p_C (scale + gx x + gy y + bends).
+
+    x and y (m) are those of the point as it was measured, in the camera frame.
 
     ``gradient_per_m`` is (gx, gy) in 1/m. ``bend`` is empty, or the factors of x^2, x y, y^2 (1/m^2), or those and of
     x^3, x^2 y, x y^2, y^3 (1/m^3): what a lens that is not quite known does. Bends hold within ``field_m`` (smallest
@@ -176,8 +177,10 @@ def correction_of(change: Array, field: tuple[float, float, float, float] | None
 
 
 def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
-    """Standard deviations (K,) of the factors of a scanner before its first scan; bends by their size at the edge of
-    the image."""
+    """Standard deviations (K,) of the factors of a scanner before its first scan.
+
+    Bends by their size at the edge of the image.
+    """
     edge = _EDGE * depth
     bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
     return np.concatenate([_USUAL if usual else LOOSE, bends])[:terms]

@@ -1,5 +1,7 @@
-"""Read the pose that another program, or weldcal, calibrated: matrices, quaternions, URDF origins, static transforms
-and result files."""
+"""Read the pose that another program, or weldcal, calibrated.
+
+Matrices, quaternions, URDF origins, static transforms and result files.
+"""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -186,8 +188,10 @@ def _of_tree(tree: Any, name: str) -> tuple[list[Listing], _Own]:
 
 
 def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own] | None:
-    """The camera's pose in weldcal's files: hand_eye.yaml or .json, calibration.yaml, X_BC.json and what --json prints;
-    None for others."""
+    """The camera's pose in weldcal's files: hand_eye.yaml or .json, calibration.yaml, X_BC.json and what --json prints.
+
+    None for others.
+    """
     configuration = tree.get("configuration")
     mounting = configuration if configuration in MOUNTINGS else None
     poses = tree.get("poses")

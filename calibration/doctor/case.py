@@ -20,6 +20,8 @@ from weldcal.models.errors import InputError
 Which = NDArray[np.bool_] | NDArray[np.int64]
 
 NAME = "observations.csv"
+FEWEST = 5
+"""Scans below which nothing is diagnosed."""
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 _SEEN = (*(f"centre_{a}" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "noise", "coverage")
 _COLUMNS = ("id", *_POSE, *_SEEN)
@@ -29,8 +31,11 @@ _REFUSED = "refused"
 
 @dataclass(frozen=True, eq=False)
 class ArmDerivatives:
-    """What joint zeros and link lengths of p numbers do: change D (n, 3, p) of p_CR's place in the base, change T (n,
-    3, p) of the normals, and one sigma (p,) of the numbers for an arm as it leaves the factory."""
+    """What joint zeros and link lengths of p numbers do.
+
+    Change D (n, 3, p) of p_CR's place in the base, change T (n, 3, p) of the normals, and one sigma (p,) of the numbers
+    for an arm as it leaves the factory.
+    """
 
     D: Array
     T: Array
@@ -39,9 +44,11 @@ class ArmDerivatives:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DoctorCase:
-    """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and
-    outward normals m (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise``
-    (n,) m rms of each face about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
+    """n scans of a flange.
+
+    X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m (n, 3)
+    in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face
+    about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
 
     ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the
     feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
@@ -155,8 +162,10 @@ def case_of(
 
 
 def case_text(case: DoctorCase) -> str:
-    """The table: a row for each scan (m, rad), with the feature, the guess and the refused scans as rows of their
-    own."""
+    """Write the table of a case, a row for each scan (m, rad).
+
+    The feature, the guess and the refused scans have rows of their own.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     words = {

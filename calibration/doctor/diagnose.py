@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.case import FEWEST, DoctorCase
 from weldcal.calibration.doctor.fit import NU, CauseFit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.geometry.robust import f_tail
@@ -24,7 +24,6 @@ UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
 """Millimetres, inches, decimetres and centimetres for metres, and the reverse."""
 _WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's order changes spreads, too
 _REACH_M = (0.02, 9.0)
-FEWEST = 5
 WORN = 0.25  # of a soft tip's gain: four times the spread of a good one (servo settings, gain_sigma)
 LOOKS_WRONG_M, LOOKS_WRONG_RAD = 3e-3, 0.03  # residuals of no arm and scanner that work
 _Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
@@ -87,6 +86,11 @@ def _misreadings(case: DoctorCase) -> Iterator[tuple[str, str, DoctorCase, Docto
         yield cause, words, case, case.with_poses(pose(R, case.X_BF[:, :3, 3]))
     words = "the poses are the base in the flange, the inverse of what is expected"
     yield "poses inverted", words, case, case.with_poses(inverse(case.X_BF))
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        swapped = case.X_BF.copy()
+        swapped[:, [first, second], 3] = swapped[:, [second, first], 3]
+        words = f"the columns {'xyz'[first]} and {'xyz'[second]} of the poses are exchanged"
+        yield "position columns exchanged", words, case, case.with_poses(swapped)
     flip = np.array([-1.0, 1.0, 1.0])  # one mirror stands for all: the others are turned ones
     words = "the scanner's frame is left-handed: one of its axes is mirrored"
     yield "scanner axes mirrored", words, case, replace(case, c=case.c * flip, m=case.m * flip)
@@ -112,8 +116,10 @@ def looks_wrong(one: CauseFit) -> bool:
 
 
 def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else
-    None."""
+    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
+
+    Else None.
+    """
     found: list[Reading] = []
     for cause, words, given, other in _misreadings(case):
         one = fit(other)
@@ -164,8 +170,10 @@ def _scaled(case: DoctorCase, what: str, factor: Array) -> DoctorCase:
 
 @dataclass(frozen=True, eq=False)
 class DirectCause:
-    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its
-    numbers."""
+    """A cause that shows without a model of the residuals.
+
+    Its name, its weight (twice a log-likelihood ratio) and its numbers.
+    """
 
     cause: str
     score: float
@@ -174,8 +182,10 @@ class DirectCause:
 
 
 def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
-    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their
-    errors)."""
+    """Single scans that disagree with all others, each of them anywhere.
+
+    Uniform in the ball that holds their errors.
+    """
     r = np.linalg.norm(null.e, axis=1)
     scale = max(float(np.median(r)) / 1.5382, 2e-5)
     bad = r > _GROSS * scale
@@ -201,8 +211,10 @@ def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def sure_outliers(case: DoctorCase, null: CauseFit) -> DirectCause | None:
-    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the
-    residuals."""
+    """Find single scans whose errors are far too large for scans that agree.
+
+    Such errors would show once in a thousand sets, by Student's t of the residuals.
+    """
     r = np.linalg.norm(null.e, axis=1)
     chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
     bad = (chance * case.n < _ODD) & (r > _GROSS_M)
@@ -283,8 +295,7 @@ def too_alike(case: DoctorCase) -> DirectCause | None:
 
 
 def installation(case: DoctorCase, one: CauseFit) -> DirectCause | None:
-    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans
-    agree."""
+    """Compare the camera's place with a measured one, beyond the measurement's stated error, while all scans agree."""
     if case.guess is None:
         return None
     seen = case.c @ one.R[0].T + one.p[0]
@@ -316,8 +327,10 @@ def _off(u: Array, z: Array) -> float:
 
 
 def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both
-    agree."""
+    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
+
+    None where both agree.
+    """
     seen = np.asarray(np.isfinite(case.m).all(axis=1))
     if seen.sum() < 5:
         return None
@@ -356,9 +369,11 @@ CLEAR = 1.2  # factor by which a cause must bring the median residual down
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the
-    log-likelihood ratio less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and
-    the scans ``where`` it shows.
+    """A named cause with the evidence for it.
+
+    ``confidence`` 0 to 1 is its weight among the models that were compared, ``score`` twice the log-likelihood ratio
+    less the cost of its numbers. ``numbers`` are the evidence, ``words`` those of a misreading, and ``where`` the scans
+    that show it.
     """
 
     name: str
@@ -371,8 +386,10 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them
-    best."""
+    """The causes, likeliest first.
+
+    The number of scans, and the spread (m) of their centres about what explains them best.
+    """
 
     causes: tuple[Cause, ...]
     n: int

@@ -27,8 +27,9 @@ _BEST = 0.6  # share of the scans that the start must explain
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CauseFit:
-    """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of
-    centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
+    """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,).
+
+    Residuals of centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
 
     ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers
     with a prior cost: the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
@@ -61,8 +62,10 @@ class CauseFit:
 
 
 def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
-    """Rotation (3, 3) and position (3,) that explain most of the centres (least trimmed squares over seeded
-    triples)."""
+    """Rotation (3, 3) and position (3,) that explain most of the centres.
+
+    Least trimmed squares over seeded triples.
+    """
     n = len(b)
     sets = drawn_triples(n, _TRIPLES if n > 3 else 1, seed)
     R, t = fit_rigid_sets(b[sets], c[sets])
@@ -201,8 +204,10 @@ def fit(
 
 
 def _narrowed(rows: Array, held: NDArray[np.bool_], sigma: Array) -> float:
-    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free (twice Laplace's
-    factor)."""
+    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free.
+
+    Twice Laplace's factor.
+    """
     H = rows.T @ rows
     cross = H[np.ix_(~held, held)]
     kept = H[np.ix_(held, held)] - cross.T @ np.linalg.lstsq(H[np.ix_(~held, ~held)], cross, rcond=1e-12)[0]

@@ -4,11 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.doctor.case import ArmDerivatives, DoctorCase
 from weldcal.calibration.doctor.fit import CauseFit, fit
-from weldcal.calibration.geometry.se3 import exp_rotation, log_rotation, skew
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, fit_with_offset, log_rotation, skew
 from weldcal.models.arms.chain import Chain, chain_inverse, chain_poses, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -29,8 +28,10 @@ _ZERO_RAD, _LENGTH_M = 5e-3, 4e-3  # what joint zeros and link lengths of two ar
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its
-    numbers."""
+    """A cause's model fitted.
+
+    Its criterion (less is better), the fit, how far it moves the centres (rms, m) and its numbers.
+    """
 
     cause: str
     bic: float
@@ -102,8 +103,10 @@ def tcp(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def _faces_straight(case: DoctorCase, found: CauseFit) -> DoctorCase | None:
-    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were
-    seen."""
+    """The case with the poses turned so that the faces seen look along z.
+
+    None where they do, or no normals were seen.
+    """
     has = np.isfinite(case.m).all(axis=1)
     if has.sum() < 4:
         return None
@@ -123,34 +126,16 @@ def _faces_straight(case: DoctorCase, found: CauseFit) -> DoctorCase | None:
 
 def _tcp_starts(case: DoctorCase, null: CauseFit) -> Iterator[CauseFit]:
     """Camera poses with the rotation's nine numbers free, so that an offset of any size is linear."""
-    n = case.n
-    if n < 6:
-        return
-    A = np.zeros((n, 3, 15))
-    for k in range(3):
-        A[:, k, 3 * k : 3 * k + 3] = case.c
-    A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -case.X_BF[:, :3, :3]
-    x = np.linalg.lstsq(A.reshape(-1, 15), case.b.ravel(), rcond=1e-9)[0]
-    U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    yield CauseFit(
-        R=np.asarray(R[None]),
-        p=np.asarray(x[9:12][None]),
-        scanner=null.scanner,
-        a=np.asarray(x[12:]),
-        e=null.e,
-        tilt=null.tilt,
-        sigma_m=0.0,
-        sigma_rad=0.0,
-        loglik=0.0,
-        size=0,
-        n=n,
-    )
+    if case.n >= 6:
+        R, p, offset = fit_with_offset(case.b, case.c, case.X_BF[:, :3, :3])
+        yield replace(null, R=R[None], p=p[None], a=offset)
 
 
 def scaled(case: DoctorCase, null: CauseFit) -> Explained:
-    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit
-    itself."""
+    """The scanner's scale free of what is usual.
+
+    Least squares along the undisturbed fit, then twice by the fit itself.
+    """
     b, c = case.b - case.b.mean(axis=0), (case.c - case.c.mean(axis=0)) @ null.R[0].T
     ratio = float((b * c).sum() / max(float((c * c).sum()), 1e-12))
     for _ in range(2):
@@ -185,8 +170,10 @@ def drift(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def loose(case: DoctorCase, null: CauseFit) -> Explained | None:
-    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of
-    them."""
+    """Two states that the scans fall into in no order.
+
+    An offset in the flange's frame, or of the camera, in some of them.
+    """
     n = case.n
     if n < 8:
         return None
@@ -236,13 +223,20 @@ def _two_states(case: DoctorCase, null: CauseFit, T: Array, state: Array) -> tup
     return one.bic + float(labels) + 2.0 * np.log(4.0), one, state
 
 
-def kinematics(case: DoctorCase, null: CauseFit) -> Explained | None:
-    """Other joint zeros and link lengths than those by which the poses were computed."""
+def _arm_of(case: DoctorCase) -> Chain | None:
+    """The arm of a case; None where it is not known, or has too few scans to judge it by."""
     if not case.robot or case.n < FEWEST_FOR_ARM:
         return None
     try:
-        arm = load_chain(case.robot)
+        return load_chain(case.robot)
     except InputError:
+        return None
+
+
+def kinematics(case: DoctorCase, null: CauseFit) -> Explained | None:
+    """Other joint zeros and link lengths than those by which the poses were computed."""
+    arm = _arm_of(case)
+    if arm is None:
         return None
     best = another_arm(case, null, arm)
     bare = replace(case, arm=None)
@@ -260,13 +254,12 @@ def kinematics(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def with_arm_errors(case: DoctorCase) -> DoctorCase:
-    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans
-    best."""
-    if not case.robot or case.n < FEWEST_FOR_ARM:
-        return case
-    try:
-        arm = load_chain(case.robot)
-    except InputError:
+    """Return the case with the errors of its arm as it leaves the factory.
+
+    The branch of joint angles is the one that suits the scans best.
+    """
+    arm = _arm_of(case)
+    if arm is None:
         return case
     best: tuple[float, DoctorCase] | None = None
     for q in joint_angles(case, arm):
@@ -284,8 +277,10 @@ def with_arm_errors(case: DoctorCase) -> DoctorCase:
 
 
 def another_arm(case: DoctorCase, null: CauseFit, arm: Chain) -> Explained | None:
-    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans
-    better."""
+    """The poses as another arm makes them from the same joint angles.
+
+    None where no other arm explains the scans better.
+    """
     best: Explained | None = None
     if null.rms < _ANOTHER_ARM_M or arm.name not in known_arms():
         return None
@@ -306,7 +301,7 @@ def another_arm(case: DoctorCase, null: CauseFit, arm: Chain) -> Explained | Non
 
 def joint_angles(case: DoctorCase, arm: Chain) -> Iterator[Array]:
     """Joint angles (n, joints) for all poses, on each branch of the arm that reaches them all."""
-    poses = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in case.X_BF]
+    poses = [as_transform(X) for X in case.X_BF]
     if arm.name in known_arms():
         model = load_arm(arm.name)
         answers = [inverse_kinematics(model, X) for X in poses]
@@ -327,8 +322,11 @@ def joint_angles(case: DoctorCase, arm: Chain) -> Iterator[Array]:
 
 
 def _arm_columns(case: DoctorCase, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only
-    move base or flange), and one sigma (p,) of those numbers between two files of one arm."""
+    """Differentiate the feature's centre and normal (n, 3, p) by joint zeros and link lengths.
+
+    Those that only move base or flange are left out. Also returns one sigma (p,) of those numbers between two files of
+    one arm, and their names.
+    """
     poses = chain_poses(arm, q)
     made: list[Array] = []
     sigma: list[float] = []

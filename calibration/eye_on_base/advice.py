@@ -81,8 +81,10 @@ def sampling_advice(
 
 
 def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
-    """The place (3,) m with the largest uncertainty of a scanned point, of the ends of the principal axes of poses (n,
-    3) m, half as far again."""
+    """Find the place (3,) m with the largest uncertainty of a scanned point.
+
+    It is one of the ends of the principal axes of poses (n, 3) m, half as far again.
+    """
     middle = p_B.mean(axis=0)
     spread = np.linalg.svd(p_B - middle, full_matrices=False)
     reach = spread[2] * (spread[1] / np.sqrt(len(p_B)))[:, None]

@@ -1,5 +1,7 @@
-"""Finds roughly where the scanner stands from the visible arm: its capsules at the recorded joints against one scan or
-more."""
+"""Finds roughly where the scanner stands from the visible arm.
+
+Its capsules at the recorded joints against one scan or more.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
@@ -17,7 +19,7 @@ from weldcal.calibration.errors import DatasetError, FlangeNotFound, Inconsisten
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
-from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, frames_along, pose
 from weldcal.models.arms.chain import Chain, chain_capsules, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
@@ -111,8 +113,10 @@ class ArmStart:
 def see_with_arm(
     data: Dataset, seen: FlangeObservations, standard: FlangeStandard, robot: str, *, seed: int = 0
 ) -> tuple[FlangeObservations, ArmStart | None]:
-    """The flanges of scans, looked for where the visible arm puts them; as they were seen where the arm decides
-    nothing."""
+    """The flanges of scans, looked for where the visible arm puts them.
+
+    As they were seen where the arm decides nothing.
+    """
     start = start_from_arm(data, robot, seed=seed)
     if start is None or not start.accepted:
         return seen, start
@@ -129,8 +133,9 @@ def see_with_arm(
 
 
 def face_guess(points: Array, X_CR: RigidTransform, standard: FlangeStandard) -> FlangeGuess:
-    """Where the flange's face is in a cloud (N, 3) m, to a millimetre or two, from a pose X_CR that is right to some
-    centimetres.
+    """Locate the flange's face in a cloud (N, 3) m, to a millimetre or two, from a rough pose X_CR.
+
+    The pose is right to some centimetres.
 
     The face is where most points lie on the ring, and fewest in the bore and just outside, on a plane
     along the expected axis; plane and place are found in turns.
@@ -196,8 +201,10 @@ def start_from_arm(data: Dataset, robot: str, *, seed: int = 0) -> ArmStart | No
 
 
 def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
-    """Recorded joint angles (n,) rad by scan; none where there are none, or where they lead elsewhere than the stated
-    poses."""
+    """Recorded joint angles (n,) rad by scan.
+
+    None where there are none, or where they lead elsewhere than the stated poses.
+    """
     try:
         q = joint_angles(data, ids, arm.n)
     except DatasetError:
@@ -210,8 +217,7 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
 
 
 def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
-    """Joint angles of the scans for each branch of the inverse kinematics of a Universal Robots arm, followed from scan
-    to scan."""
+    """Follow the joint angles of the scans on each branch of the inverse kinematics of a Universal Robots arm."""
     poses = [data.poses[id] for id in ids]
     if arm.name not in known_arms() or not ids:
         return []
@@ -249,8 +255,9 @@ def capsule_distance(points: Array, shape: ArmShape) -> tuple[Array, Array]:
 
 
 def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int = 0) -> ArmStart | None:
-    """X_BC to some centimetres from clouds, m in C, and the arm's capsules at each; None where too little of the arm is
-    seen.
+    """X_BC to some centimetres from clouds, m in C, and the arm's capsules at each.
+
+    None where too little of the arm is seen.
 
     What stands still in two clouds or more is no arm. Points of a scan with their normals are laid on points of the
     arm's surface, turned about the common normal; the scanner then must see the arm's surface wherever nothing hides
@@ -274,14 +281,15 @@ def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int =
     judged = sorted(((*_verdict(X, able, allowance), X) for X, allowance in ended), key=lambda one: one[1] - one[0])
     explained, through, best = judged[0]
     others = [e - t for e, t, other in judged[1:] if not _same(best, other, able)]
-    return ArmStart(_rigid(best), explained, through, explained - through, max(others, default=-1.0))
+    return ArmStart(as_transform(best), explained, through, explained - through, max(others, default=-1.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _View:
-    """A scan against the arm: points (N, 3) m on what moved with their normals, depth image (h, w) m of the nearest
-    points with the rays' origin and pitch, samples of the arm's surface (S, 3) m in B with normals, and its distance
-    field with its origin.
+    """A scan against the arm.
+
+    Points (N, 3) m on what moved with their normals, depth image (h, w) m of the nearest points with the rays' origin
+    and pitch, samples of the arm's surface (S, 3) m in B with normals, and its distance field with its origin.
     """
 
     points: Array
@@ -418,33 +426,17 @@ def _hypotheses(view: _View, rng: np.random.Generator) -> Array:
     """Poses X_BC (n, 4, 4) that lay a point of the scan on one of the arm's surface, normal on normal."""
     data = rng.permutation(len(view.points))[: _ANCHORS[0]]
     model = rng.permutation(len(view.samples))[: _ANCHORS[1]]
-    frame_C, frame_B = _frames(view.normals[data]), _frames(view.outward[model])
+    frame_C, frame_B = frames_along(view.normals[data]), frames_along(view.outward[model])
     angle = np.arange(_TURNS) * 2.0 * np.pi / _TURNS
-    turn = np.zeros((_TURNS, 3, 3))
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = (
-        np.cos(angle),
-        -np.sin(angle),
-        np.sin(angle),
-        np.cos(angle),
-    )
-    turn[:, 2, 2] = 1.0
+    turn = exp_rotation(angle[:, None] * [0.0, 0.0, 1.0])
     R = np.einsum("mij,tjk,dlk->mtdil", frame_B, turn, frame_C)
-    X = np.zeros((*R.shape[:3], 4, 4))
-    X[..., :3, :3], X[..., 3, 3] = R, 1.0
-    X[..., :3, 3] = view.samples[model][:, None, None] - np.einsum("mtdij,dj->mtdi", R, view.points[data])
-    return X.reshape(-1, 4, 4)
+    p = view.samples[model][:, None, None] - np.einsum("mtdij,dj->mtdi", R, view.points[data])
+    return pose(R, p).reshape(-1, 4, 4)
 
 
 def _likely(X: Array, views: Sequence[_View], most: int) -> Array:
     """Of poses (n, 4, 4) those that lay most of the scans' points on the arm."""
     return X[np.argsort(-np.mean([view.on_arm(X) for view in views], axis=0), kind="stable")[:most]]
-
-
-def _frames(z: Array) -> Array:
-    """Rotations (n, 3, 3) whose third column is z (n, 3)."""
-    x = np.cross(z, np.where(np.abs(z[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
 def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
@@ -481,11 +473,7 @@ def _verdict(X: Array, views: Sequence[_View], allowance: float) -> tuple[float,
 
 def _same(X: Array, Y: Array, views: Sequence[_View]) -> bool:
     """Whether two poses put the arm's points to about the same place."""
-    turn = float(np.arccos(np.clip(0.5 * (np.trace(X[:3, :3].T @ Y[:3, :3]) - 1.0), -1.0, 1.0)))
+    turn = float(angle_of(X[:3, :3].T @ Y[:3, :3]))
     middle = np.mean([view.points.mean(axis=0) for view in views], axis=0)
     far = float(np.linalg.norm((X[:3, :3] - Y[:3, :3]) @ middle + X[:3, 3] - Y[:3, 3]))
     return turn < _SAME_RAD and far < _SAME_M
-
-
-def _rigid(X: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])

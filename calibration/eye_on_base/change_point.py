@@ -31,9 +31,11 @@ _FLOOR_M = 1e-6  # as in solve.py: below any scanner or arm, keeps exact data fr
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChangePoint:
-    """A change between two poses: ids of the last before and of the first after it; the two camera poses; the rms
-    shift (m) of the flange centres that it makes, the spread per axis (m) with and without it, and the probability
-    by chance."""
+    """A change between two poses: ids of the last before and of the first after it; the two camera poses.
+
+    The rms shift (m) of the flange centres that it makes, the spread per axis (m) with and without it, and the
+    probability by chance.
+    """
 
     index: int
     before: str
@@ -118,8 +120,10 @@ class _Split:
 
 
 def _starts(observations: Sequence[Observation]) -> list[RigidTransform]:
-    """Camera poses to begin with: from all poses, from the first and from the last of them; those that can be estimated
-    and that lead elsewhere than an earlier one."""
+    """Camera poses to begin with: from all poses, from the first and from the last of them.
+
+    Those that can be estimated and that lead elsewhere than an earlier one.
+    """
     n = len(observations)
     config = SolveConfig(leave_one_out=False, hypotheses=150, allow_coplanar=True)
     middle = np.mean([o.p_CR for o in observations], axis=0)
@@ -141,8 +145,9 @@ def _starts(observations: Sequence[Observation]) -> list[RigidTransform]:
 def _fit(
     b: Array, c: Array, start: RigidTransform, split: int | None, order: int, sigma: float | None = None
 ) -> _Split:
-    """Camera poses before and from ``split`` on (None: one for all) and the scanner's factors, by reweighted
-    Gauss-Newton.
+    """Fit camera poses before and from ``split`` on, and the scanner's factors, by reweighted Gauss-Newton.
+
+    ``split`` None: one pose for all.
 
     ``sigma`` (m, an axis) is estimated from the residuals where it is not given.
     """

@@ -79,8 +79,10 @@ def with_scanner(
     joint: Array | None,
     redundancy: float,
 ) -> CalibrationEstimate:
-    """The estimate with a corrected scanner and the camera's pose that goes with it, their ``joint`` covariance widened
-    for spreads that were estimated with that ``redundancy``."""
+    """Return the estimate with a corrected scanner and the camera's pose that goes with it.
+
+    Their ``joint`` covariance is widened for spreads that were estimated with that ``redundancy``.
+    """
     joint = np.zeros((9, 9)) if joint is None else joint * few_residuals(redundancy)
     return replace(estimate, X_BC=X_BC, scanner=scanner, joint=joint, covariance=joint[:6, :6])
 

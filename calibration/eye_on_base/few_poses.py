@@ -70,9 +70,11 @@ def estimate_from_whole_poses(
 def axis_turn(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float]:
-    """How far (rad) the drilled pattern is turned about the face normal from the robot's flange frame, and its spread
-    over the scans (standard deviation, rad; NaN for one scan). Circular median over the scans that show its rotation;
-    raises TooFewPoses where none does."""
+    """Measure how far (rad) the drilled pattern is turned from the robot's flange frame, and its spread over the scans.
+
+    The turn is about the face normal, the spread a standard deviation (rad; NaN for one scan). Circular median over the
+    scans that show the pattern's rotation; raises TooFewPoses where none does.
+    """
     turns = []
     for o in _with_turn(observations, patterns):
         R = (o.X_BR.rotation().inverse() @ X_BC.rotation() @ patterns[o.id].X_CR.rotation()).matrix()
@@ -107,8 +109,9 @@ def calibrate_from_few(
     *,
     seed: int = 0,
 ) -> CalibrationEstimate:
-    """X_BC from one to three observations, with a covariance from the usual errors of robot and scanner where the data
-    are too few.
+    """Estimate X_BC from one to three observations.
+
+    The covariance takes the usual errors of robot and scanner where the data are too few.
 
     With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three
     pairs, or two scans with face normals. Held-out errors are those of each pose under the others, NaN where the others

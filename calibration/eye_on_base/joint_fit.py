@@ -31,9 +31,10 @@ _HYPOTHESES = 60  # of an estimate from poses that are cleared of gross outliers
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScannerVerdict:
-    """What the scans say of the scanner: the correction to apply (None: none), what the robot's motion and the flange's
-    hole circle ask for, each alone (None where unknown), and the sentence; ``worth_saying`` where a reader of the
-    result should know it.
+    """What the scans say of the scanner.
+
+    The correction to apply (None: none), what the robot's motion and the flange's hole circle ask for, each alone (None
+    where unknown), and the sentence; ``worth_saying`` where a reader of the result should know it.
     """
 
     accepted: ScannerCorrection | None
@@ -119,7 +120,7 @@ def solve_jointly(
 
 def _fit(good: Sequence[Observation], patterns: Mapping[str, HolePattern], X_rigid: RigidTransform, seed: int) -> _Fit:
     """Estimate pose and correction from poses without outliers (n >= 4), and decide on the correction."""
-    motion, holes, contradict = None, None, False
+    motion, holes, contradict = None, None, False  # each alone, only to see whether the two sources contradict
     if len(good) >= _LEAST_TO_COMPARE:
         motion = from_motion(good, {}, seed=seed, start=X_rigid)
         holes = from_holes(good, patterns)
@@ -147,8 +148,10 @@ def _held_out(
     fit: _Fit,
     seed: int,
 ) -> HeldOut:
-    """Errors of each pose under estimates that did not see it; outliers are measured against the estimate from the
-    others."""
+    """Errors of each pose under estimates that did not see it.
+
+    Outliers are measured against the estimate from the others.
+    """
     n = len(observations)
     position, tilt = np.full((2, n), np.nan)
     folds = min(n, _FOLDS)

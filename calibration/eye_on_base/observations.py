@@ -1,5 +1,7 @@
-"""Fits the flange in every cloud of a dataset, with the reasons of refused scans, and decides how its poses are to be
-read."""
+"""Fit the flange in every cloud of a dataset, and decide how its poses are to be read.
+
+Refused scans have a reason.
+"""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -40,8 +42,11 @@ _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error
 
 @dataclass(frozen=True, eq=False)
 class FlangeObservations:
-    """Results of the flange fits: an observation for each usable scan, its fit, its hole pattern where one shows and
-    its face's points (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
+    """Results of the flange fits.
+
+    An observation for each usable scan, its fit, its hole pattern where one shows and its face's points (N, 3) m by id
+    (none for pairs), and (id, reason) for each scan that is refused.
+    """
 
     observations: tuple[Observation, ...]
     fits: dict[str, FlangeFit]
@@ -152,9 +157,11 @@ def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransfor
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanAgreement:
-    """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m) of so
-    many scans that are no outliers, the spread of the centres (m), R_BC and p_BC, and whether a list is changed beyond
-    what is stated."""
+    """How well the scans agree with a reading.
+
+    Rms angle of the normals (rad) and distance of the centres (m) of so many scans that are no outliers, the spread of
+    the centres (m), R_BC and p_BC, and whether a list is changed beyond what is stated.
+    """
 
     reading: PoseReading
     scans: int
@@ -174,8 +181,9 @@ class ScanAgreement:
 def choose_reading(
     readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
-    """The reading of the flange poses with which the scans agree, and a sentence about it; None where the usual one
-    stands.
+    """The reading of the flange poses with which the scans agree, and a sentence about it.
+
+    None where the usual one stands.
 
     Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the
     rigid X_BC that fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom,

@@ -18,7 +18,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.robust import chi2_share, cross_rows, rotation_of
+from weldcal.calibration.geometry.robust import MAD, chi2_share, cross_rows, rotation_of
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
@@ -77,8 +77,9 @@ def from_motion(
     usual: bool = False,
     start: RigidTransform | None = None,
 ) -> CorrectionEstimate:
-    """Fit correction and camera pose together to observations (n >= 3) and robot poses; with ``patterns`` the hole
-    circles' nominal size is fitted, too.
+    """Fit correction and camera pose together to observations (n >= 3) and robot poses.
+
+    With ``patterns`` the hole circles' nominal size is fitted, too.
 
     The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With
     ``usual`` it is held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton
@@ -172,8 +173,9 @@ def _gauss_newton(
     sigma_n: float,
     sigma_r: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float]:
-    """The loop of from_motion: pose, change of the unknowns after it, information, redundancy of positions, both
-    sigmas.
+    """The loop of from_motion.
+
+    Pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
 
     Centres c, b (n, 3) with ``vague`` (n,) and the correction's terms (n, K); of those with a normal m (h, 3), z (h, 3)
     in the base, their centres, terms and ``slopes`` (h, K, 2); of k hole circles rows (k, K) and ratio (k,). ``prior``
@@ -262,13 +264,14 @@ def _gauss_newton(
 @compiled()
 def _spread(e: Array, count: int) -> float:
     """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
-    limit = 4.0 * 1.4826 * np.median(np.abs(e))
+    limit = 4.0 * MAD * np.median(np.abs(e))
     return np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count)  # type: ignore[no-any-return]
 
 
 def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple[Array, Array]:
-    """Of k hole circles: derivative (k, K) of their stretch by the factors of ``shape``, and measured over nominal size
-    (k,).
+    """Of k hole circles.
+
+    Derivative (k, K) of their stretch by the factors of ``shape``, and measured over nominal size (k,).
 
     The stretch of a small circle is half the trace of the correction's derivative in the circle's plane.
     """
@@ -280,8 +283,10 @@ def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple
 
 
 def _ratio_sigma(rows: Array, ratio: Array) -> float:
-    """Spread of the measured sizes of hole circles about the best correction for them alone, and what is expected of
-    it."""
+    """Estimate the spread of the measured sizes of hole circles about the best correction for them alone.
+
+    The expected spread counts, too.
+    """
     square, dof = 0.0, 0
     if len(ratio) > 3:
         left = 1.0 / ratio - rows @ np.linalg.lstsq(rows, 1.0 / ratio, rcond=1e-6)[0]

@@ -331,8 +331,9 @@ def _gauss_newton(
     var_n: float,
     usual: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float, float]:
-    """The loop of _fit: pose, information of all and of the positions, redundancies and variance components of both
-    kinds.
+    """The loop of _fit.
+
+    Pose, information of all and of the positions, redundancies and variance components of both kinds.
 
     Places b and centres c (n, 3) with the fits' covariances (n, 3, 3); normals m seen and z stated (h, 3) with their
     variances (h,).
@@ -414,8 +415,9 @@ def _covariance_at_camera(solution: _Solution) -> Array:
 
 
 def _widened(solution: _Solution) -> Array:
-    """Covariance about the pivot, such that its Gaussian 95 % region holds the truth in 95 of 100 calibrations of few
-    poses.
+    """Widen the covariance about the pivot for few poses.
+
+    Its Gaussian 95 % region then holds the truth in 95 of 100 calibrations.
 
     Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
     Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the

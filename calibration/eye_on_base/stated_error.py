@@ -75,9 +75,11 @@ def stated_median_limit(
 def joint_terms(
     result: CalibrationResult, correction: ScannerCorrection | None
 ) -> tuple[Array, ScannerCorrection | None]:
-    """The covariance of X_BC and correction together, (6 + K, 6 + K), with the correction whose K terms belong to it
-    (one that changes nothing where the scanner was not found wrong); that of X_BC alone and None where the two do not
-    fit."""
+    """Return the covariance (6 + K, 6 + K) of X_BC and correction, and the correction with its K terms.
+
+    The correction changes nothing where the scanner was not found wrong. Where the two do not fit: the covariance of
+    X_BC alone, and None.
+    """
     joint = result.joint_covariance
     if joint is not None and correction is None and len(joint) - 6 in TERMS.values():
         correction = ScannerCorrection.unchanged(len(joint) - 6)
@@ -86,9 +88,29 @@ def joint_terms(
     return joint, correction
 
 
+def observed_document(
+    observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
+) -> dict[str, Any]:
+    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
+    joints where known."""
+    X = X_FR or RigidTransform()
+    return {
+        "feature_xyz": [float(v) for v in X.translation()],
+        "feature_wxyz": [float(v) for v in X.rotation().ToQuaternion().wxyz()],
+        "xyz": [[float(v) for v in o.p_BR] for o in observations],
+        "wxyz": [[float(v) for v in o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations],
+        "camera": [[float(v) for v in o.p_CR] for o in observations],
+        "normals": [None if o.n_C is None else [float(v) for v in o.n_C] for o in observations],
+        "joints": [[float(v) for v in q] for q in joints],
+    }
+
+
 def orientations_of(observations: Sequence[Observation], X_FR: RigidTransform | None = None) -> dict[str, Any]:
-    """Mean orientation of the feature in the base and the largest angle (deg) from it, for
-    CalibrationResult.orientations; with the feature's orientation on the flange where X_FR turns it."""
+    """Summarise the feature's orientations in the base for CalibrationResult.orientations.
+
+    They are the mean and the largest angle (deg) from it, with the feature's orientation on the flange where X_FR turns
+    it.
+    """
     turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
     mean = turned.mean()
     x, y, z, w = (float(v) for v in mean.as_quat())

@@ -10,13 +10,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, fit_with_offset, skew
 from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
 _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
 _ARM_M = 5e-4  # a choice: a maker's calibration usually leaves 0.4 mm; half would name joint errors as a TCP
-"""What arms err systematically per coordinate (1 mm a point).
+"""What arms err systematically per coordinate.
 
 However such errors are spread over the poses, they move the offset by no more than the norm of its row of the
 pseudo-inverse times theirs: a weak geometry makes much of little.
@@ -132,8 +132,11 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
 
 @dataclass(frozen=True)
 class _Data:
-    """Centres c (n, 3) in the camera, b (n, 3) in the base, rotations R (n, 3, 3) of the poses, terms (n, K), weights
-    (n,)."""
+    """The data of a fit, one row a pose.
+
+    Centres c (n, 3) in the camera, b (n, 3) in the base, rotations R (n, 3, 3) of the poses, terms (n, K), weights
+    (n,).
+    """
 
     c: Array
     b: Array
@@ -216,19 +219,14 @@ def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = Tru
 
 
 def _linear_start(data: _Data) -> RigidTransform | None:
-    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear; None below six
-    poses."""
-    n = len(data.c)
-    if n < 6:
+    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear.
+
+    None below six poses.
+    """
+    if len(data.c) < 6:
         return None
-    A = np.zeros((n, 3, 15))
-    for k in range(3):
-        A[:, k, 3 * k : 3 * k + 3] = data.c
-    A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -data.R
-    x = np.linalg.lstsq(A.reshape(-1, 15), data.b.ravel(), rcond=1e-9)[0]
-    U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), x[9:12])
+    R, p, _ = fit_with_offset(data.b, data.c, data.R)
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
 
 def _rigid_start(data: _Data) -> RigidTransform | None:

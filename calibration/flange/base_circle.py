@@ -186,8 +186,11 @@ def _places(u: Array, v: Array, view: _View, rays: RayModel) -> tuple[Array, Arr
 
 
 def _where_it_ends(xy: Array, lowered: Array, center: Array, view: _View) -> Array:
-    """Places (n, 2) at which a face one thickness thick ends: on the scanner's side of the ring its upright side shows,
-    and the face seems to end only where that is one thickness lower."""
+    """Places (n, 2) at which a face one thickness thick ends.
+
+    On the scanner's side of the ring its upright side shows, and the face seems to end only where that is one thickness
+    lower.
+    """
     eye = -(view.plane.point + view.axes @ center) @ view.axes  # towards the scanner, in the plane
     return np.where(((xy - center) @ eye > 0.0)[:, None], lowered, xy)
 
@@ -266,7 +269,6 @@ def _refine(
         outer_radius_m=circle.radius,
         bore_radius_m=None,
         n_points=len(points),
-        n_rim=int(rim.sum()),
         coverage=seen,
     )
 

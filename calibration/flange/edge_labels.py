@@ -88,8 +88,11 @@ def _pinhole(A: Array, p: Array) -> Array | None:
 
 
 def pinhole_window(cloud: Array, center: Array, reach: float) -> tuple[tuple[slice, slice], Array | None] | None:
-    """Rectangle of the pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of
-    all pixels; and their rays, as ``pinhole_rays`` gives them, where that pinhole fits the whole image."""
+    """Find the rectangle of the pixels that may show a ball of radius ``reach`` m about a centre.
+
+    It follows from a pinhole through a few of all pixels. The pixels' rays, as ``pinhole_rays`` gives them, are
+    returned where that pinhole fits the whole image.
+    """
     some = _sampled(cloud, 12)
     if some is None or not float(center[2]) > 2.0 * reach:
         return None
@@ -158,8 +161,10 @@ def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch
 
 
 def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, Array, float]:
-    """Fisher scoring with step halving at one border width: parameters (cx, cy, r), information (3, 3), log
-    likelihood."""
+    """Fisher scoring with step halving at one border width.
+
+    Parameters (cx, cy, r), information (3, 3), log likelihood.
+    """
     value, gradient, information = _likelihood(xy, side, theta, width)
     for _ in range(4):
         step = np.linalg.solve(information + np.diag(1e-10 * np.diag(information) + 1e-30), gradient)

@@ -77,8 +77,10 @@ def coverage(points: Array, center: Array, sectors: int = 72) -> float:
 
 
 def connected_parts(xy: Array, cell: float) -> NDArray[np.intp]:
-    """Label (N,) of the connected part each point (N, 2) m belongs to, on a raster of ``cell`` [m]; largest
-    part is 0."""
+    """Label (N,) of the connected part each point (N, 2) m belongs to, on a raster of ``cell`` [m].
+
+    Largest part is 0.
+    """
     grid = np.floor((xy - xy.min(axis=0)) / cell).astype(int) + 1
     image = np.zeros(grid.max(axis=0) + 2, dtype=bool)
     image[grid[:, 0], grid[:, 1]] = True
@@ -126,8 +128,10 @@ class FaceRefusal:
 
 @dataclass(frozen=True)
 class FlangeFace:
-    """A flange face: its plane, its edges (centres (2,) in the plane's axes), share of the outer edge seen, and its
-    quality."""
+    """A flange face with its plane, its edges, the share of the outer edge seen, and its quality.
+
+    The edges' centres (2,) are in the plane's axes.
+    """
 
     plane: PlaneFit
     outer: CircleFit
@@ -139,9 +143,11 @@ class FlangeFace:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FaceMeasurements:
-    """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the
-    outer edge seen, the points on the face, and the shares of the bore's core and of the ring between the edges that
-    are face."""
+    """Measurements that the tests of a flange use.
+
+    Its plane and edges, the pitch between points m, the share of the outer edge seen, the points on the face, and the
+    shares of the bore's core and of the ring between the edges that are face.
+    """
 
     plane: PlaneFit
     outer: CircleFit
@@ -297,8 +303,11 @@ def _measure(
 
 
 def _margin(pitch: float, width: float) -> float:
-    """How far (m) from its edges a face ``width`` wide is taken for the plane: points within a pixel of an edge are
-    mixed with what lies behind it, and with 0.5 mm of noise they are not told from the face."""
+    """How far (m) from its edges a face ``width`` wide is taken for the plane.
+
+    Points within a pixel of an edge are mixed with what lies behind it, and with 0.5 mm of noise they are not told from
+    the face.
+    """
     return min(_MIXED * pitch, _MOST_MIXED * width)
 
 

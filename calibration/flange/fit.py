@@ -74,7 +74,6 @@ class FlangeFit:
     outer_radius_m: float | None
     bore_radius_m: float | None
     n_points: int
-    n_rim: int
     coverage: float
     outer_rms_m: float = float("nan")
     bore_rms_m: float | None = None
@@ -120,8 +119,10 @@ def fit_flange(
 def _unordered(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then
-    searched."""
+    """A list of points.
+
+    On its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then searched.
+    """
     grid = rebuild_grid(cloud)
     if grid is not None:
         on_grid = FaceRefusal()
@@ -215,8 +216,9 @@ def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, re
 
 
 def _islands(points: Array, diameter: float) -> list[Array]:
-    """Centres (3,) of the separate bodies among points (N, 3) that are about ``diameter`` m across, largest first, at
-    most 40.
+    """Return the centres (3,) of the separate bodies about ``diameter`` m across among points (N, 3).
+
+    The largest come first, at most 40.
 
     Bodies end where space is empty for 3 mm.
     """
@@ -307,7 +309,6 @@ def _result(face: FlangeFace) -> FlangeFit:
         outer_radius_m=face.outer.radius,
         bore_radius_m=None if face.bore is None else face.bore.radius,
         n_points=face.n_points,
-        n_rim=n_rim,
         coverage=face.coverage,
         outer_rms_m=face.outer.rms,
         bore_rms_m=None if face.bore is None else face.bore.rms,
@@ -315,8 +316,9 @@ def _result(face: FlangeFace) -> FlangeFit:
 
 
 def rebuild_grid(points: Array) -> Array | None:
-    """The organised scan (H, W, 3) m, NaN where nothing was measured, of an unordered cloud (N, 3) in its sensor's
-    frame.
+    """Rebuild the organised scan (H, W, 3) m of an unordered cloud (N, 3) in its sensor's frame.
+
+    Pixels where nothing was measured are NaN.
 
     A sensor measures along the rays of its pixels: x/z and y/z of the points lie on a lattice, which a polynomial of
     the third degree bends where a lens does. None where they do not: a cloud of several views, in another frame, or
@@ -398,8 +400,10 @@ def _reduced(basis: Array) -> Array:
 
 
 def _indices(ray: Array, basis: Array) -> NDArray[np.intp] | None:
-    """Pixel (N, 2) of each ray (N, 2) about the middle: a plane's lattice, or one that grows from the middle and
-    bends."""
+    """Pixel (N, 2) of each ray (N, 2) about the middle.
+
+    a plane's lattice, or one that grows from the middle and bends.
+    """
     at = ray @ np.linalg.inv(basis)
     order = np.argsort((at * at).sum(axis=1), kind="stable")
     for degree in (1, 3):

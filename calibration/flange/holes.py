@@ -26,11 +26,13 @@ _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap
 
 @dataclass(frozen=True, kw_only=True)
 class HolePattern:
-    """Holes detected in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the
-    standard, the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the
-    pitch circle measures against the standard (1 where the scanner's scale is right).
+    """Holes detected in a flange's face, and the circle and pose that they fix.
 
-    ``off_m`` (k,) is how far each hole lies from its place in the pattern and ``rms_m`` their root mean square.
+    ``holes_C`` (k, 3) m are their centres in the camera frame, ``center_C`` (3,) m that of the circle, ``X_CR`` the
+    flange's pose with the rotation about its axis. ``ratio`` is the pitch circle as measured over the standard's: 1
+    where the scanner's scale is right.
+
+    ``rms_m`` is the root mean square of how far the holes lie from their places in the pattern.
     ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation
     then translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
     ``other_turns_rad`` are rotations about the axis, from that of X_CR, under which the scan shows the pattern as well
@@ -39,14 +41,12 @@ class HolePattern:
     """
 
     holes_C: Array
-    angles_rad: Array
     center_C: Array
     X_CR: RigidTransform
     ratio: float
     rms_m: float
     turn_sigma: float = float("nan")
     covariance: Array | None = None
-    off_m: Array | None = None
     other_turns_rad: tuple[float, ...] = ()
 
     @property
@@ -96,7 +96,6 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
     covariance[3:, 3:] = fit.center_covariance
     return HolePattern(
         holes_C=fit.center_C + np.column_stack([z.real, z.imag]) @ axes.T,
-        angles_rad=angles[seen],
         center_C=fit.center_C + axes @ np.array([start.real, start.imag]),
         X_CR=RigidTransform(
             RotationMatrix.ProjectToRotationMatrix(np.column_stack([x, np.cross(n, x), n])), fit.center_C
@@ -105,7 +104,6 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
         rms_m=float(np.sqrt(np.mean(np.abs(off) ** 2))),
         turn_sigma=turn_sigma,
         covariance=covariance,
-        off_m=np.abs(off),
         other_turns_rad=others,
     )
 
@@ -135,8 +133,10 @@ def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) 
 def _placed(
     xy: Array, angles: Array, phase: float, standard: FlangeStandard, pitch: float
 ) -> tuple[NDArray[np.intp], NDArray[np.complex128], Array, complex, complex] | None:
-    """The holes at a phase (rad): which ones, their centres, covariances (k, 2, 2) m^2, shift and gain of the pattern;
-    None where fewer than four have a rim at their places."""
+    """The holes at a phase (rad): which ones, their centres, covariances (k, 2, 2) m^2, shift and gain of the pattern.
+
+    None where fewer than four have a rim at their places.
+    """
     nominal = 0.5 * np.array([standard.hole_m] * standard.n_holes + [standard.pin_m] * (len(angles) - standard.n_holes))
     start, gain = 0j, complex(0.5 * standard.pitch_circle_m * np.exp(1j * phase))
     near = _about(xy, start + gain * np.exp(1j * angles), nominal)
@@ -164,8 +164,10 @@ def _placed(
 
 
 def _phases(xy: Array, angles: Array, standard: FlangeStandard) -> list[float]:
-    """Rotations (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest, the emptiest
-    first."""
+    """Return the rotations (rad) of the standard's pattern at which its holes are emptiest, the emptiest first.
+
+    They are in the plane's axes.
+    """
     place, disc = 0.5 * standard.pitch_circle_m, 0.35 * standard.hole_m
     rho = np.sqrt(xy[0] * xy[0] + xy[1] * xy[1])
     ring = np.flatnonzero(np.abs(rho - place) < disc)
@@ -236,8 +238,11 @@ def _holes(
     *,
     passes: int,
 ) -> dict[int, CircleFit]:
-    """Circles of the holes near their expected places, by their number; those whose rim is not seen all round are left
-    out. ``threads`` is the radius of all threaded ones, where it is known already."""
+    """Circles of the holes near their expected places, by their number.
+
+    Those whose rim is not seen all round are left out. ``threads`` is the radius of all threaded ones, where it is
+    known already.
+    """
     sizes = [a.shape[1] for a in near]
     hole = np.repeat(np.arange(len(near)), sizes)
     points = np.concatenate(near, axis=1)
@@ -281,16 +286,21 @@ def _holes(
 
 
 def _similarity(z: NDArray[np.complex128], angles: Array) -> tuple[complex, complex]:
-    """Shift and gain (complex numbers are points of the plane) that take the unit circle's points at ``angles`` to
-    z."""
+    """Fit the shift and gain that take the unit circle's points at ``angles`` to z.
+
+    Complex numbers are points of the plane.
+    """
     M = np.column_stack([np.ones(len(z)), np.exp(1j * angles)])
     shift, gain = np.linalg.lstsq(M, z, rcond=None)[0]
     return complex(shift), complex(gain)
 
 
 def _turn_sigma(off: NDArray[np.complex128], gain: complex, angles: Array, covariances: Array) -> float:
-    """Spread (rad) of the pattern's rotation: the holes' own covariances (k, 2, 2) through the similarity, inflated
-    where the holes lie farther off their places than those allow (Birge ratio, never below one)."""
+    """Spread (rad) of the pattern's rotation.
+
+    The holes' own covariances (k, 2, 2) through the similarity, inflated where the holes lie farther off their places
+    than those allow (Birge ratio, never below one).
+    """
     k = len(off)
     a = np.exp(1j * angles)
     J = np.zeros((2 * k, 4))  # shift x, y, gain real, imaginary

@@ -50,7 +50,9 @@ class Observation:
 def observation_from_fit(
     id: str, X_BF: RigidTransform, fit: FlangeFit, X_FR: RigidTransform | None = None
 ) -> Observation:
-    """Pair a fitted flange with the flange pose of the robot; ``X_FR`` places the feature on the flange (identity:
-    bare)."""
+    """Pair a fitted flange with the flange pose of the robot.
+
+    ``X_FR`` places the feature on the flange (identity: bare).
+    """
     X_BR = X_BF if X_FR is None else X_BF @ X_FR
     return Observation(id, X_BR, fit.center_C, fit.normal_C, fit.center_covariance, fit.normal_sigma)

@@ -29,8 +29,11 @@ _MOST = 60  # parts that are looked at closely
 
 @dataclass(frozen=True, eq=False)
 class FlatPart:
-    """A flat part of about the flange's size: where its outer edge seems to be (centre (3,) m, radius m), the outward
-    normal (3,), and how little its outline differs from that circle."""
+    """A flat part of about the flange's size.
+
+    Where its outer edge seems to be (centre (3,) m, radius m), the outward normal (3,), and how little its outline
+    differs from that circle.
+    """
 
     center: Array
     normal: Array
@@ -95,8 +98,10 @@ def search_frame(
 
 
 def typical_pitches(cloud: Array) -> tuple[float, float] | None:
-    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no
-    two neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
+    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones.
+
+    None where no two neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them.
+    """
     step = max(1, int(np.sqrt(cloud.shape[0] * cloud.shape[1] / 4000.0)))
     a, b = cloud[:-1:step, :-1:step], cloud[:-1:step, 1::step]
     h, w = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])
@@ -109,8 +114,10 @@ def typical_pitches(cloud: Array) -> tuple[float, float] | None:
 
 
 def window_about(cloud: Array, center: Array, radius: float, step: int | tuple[int, int]) -> tuple[slice, slice] | None:
-    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every
-    ``step``-th one, or every so many rows and columns."""
+    """Find the rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,).
+
+    Pixels are looked at on every ``step``-th row and column, or on every so many.
+    """
     sv, su = (step, step) if isinstance(step, int) else step
     thin = cloud[::sv, ::su]
     with np.errstate(invalid="ignore"):
@@ -163,9 +170,11 @@ def flat_parts(
 
 
 def _noise(bend: NDArray[np.float32], inverse: NDArray[np.float32], *, by_depth: bool) -> NDArray[np.float32]:
-    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth,
-    shows, most of a scan being smooth. A floor far behind the flange may have another noise in inverse depth than the
-    flange."""
+    """Noise (h, w) of the bend at each pixel.
+
+    What the lower third of all pixels, or of those of about its depth, shows, most of a scan being smooth. A floor far
+    behind the flange may have another noise in inverse depth than the flange.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         layer = np.rint(_LAYERS * np.log(np.abs(inverse)))
     known = np.isfinite(bend) & np.isfinite(layer)
@@ -268,8 +277,10 @@ def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> t
 
 
 def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float, float] | None:
-    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m): centre, radius, misfit
-    (m)."""
+    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m).
+
+    Centre, radius, misfit (m).
+    """
     if len(hull) < 6:
         return None
     n = len(hull)

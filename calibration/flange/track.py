@@ -315,8 +315,11 @@ def near_edge(
     pitch: float,
     block: int,
 ) -> tuple[Single, Mask]:
-    """Known pixels within ``reach`` m of a circle on the plane: places (2, N) m about its centre, and which
-    lie on the face (N,). The face may end ``lowered`` m below the plane. Blocks of pixels are looked at first."""
+    """Known pixels within ``reach`` m of a circle on the plane.
+
+    Places (2, N) m about its centre, and which lie on the face (N,). The face may end ``lowered`` m below the plane.
+    Blocks of pixels are looked at first.
+    """
     h, w = face.shape
     out, on = np.empty((2, h * w), np.float32), np.empty(h * w, np.bool_)
     lower = lowered / at[2]

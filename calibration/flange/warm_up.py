@@ -14,8 +14,10 @@ _NOISE_M = 3e-5  # a choice: any noise of a good scanner takes the paths of the 
 
 @cache
 def warm_up() -> None:
-    """Run every path of the flange fit once per process: 0.05 s, or some seconds where the loops are not compiled
-    yet."""
+    """Run every path of the flange fit once per process.
+
+    0.05 s, or some seconds where the loops are not compiled yet.
+    """
     standard = get_flange(_FLANGE)
     pitch = 2.6 * standard.face_outer_radius_m / _WIDTH
     v, u = np.mgrid[:_WIDTH, :_WIDTH] - 0.5 * (_WIDTH - 1)

@@ -22,6 +22,7 @@ from weldcal.calibration.flange.face import (
 )
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
@@ -42,8 +43,10 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulat
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Window:
-    """Pixels of a window as arrays (h, w): measured depth z, its ray (rx, ry, 1), and where the ray meets the plane, in
-    the plane's axes about ``origin``."""
+    """Pixels of a window as arrays (h, w).
+
+    Measured depth z, its ray (rx, ry, 1), and where the ray meets the plane, in the plane's axes about ``origin``.
+    """
 
     z: Array
     rays: tuple[Array, Array]
@@ -134,7 +137,7 @@ def _noise(z: Array, rays: tuple[Array, Array], plane: PlaneFit) -> float:
     with np.errstate(invalid="ignore"):
         bend = np.abs(d[:, 4:] + d[:, :-4] - 2.0 * d[:, 2:-2])[np.abs(d[:, 2:-2]) < 3.0 * plane.rms]
     bend = bend[np.isfinite(bend)]
-    return float(np.median(bend)) * 1.4826 / np.sqrt(6.0) if len(bend) else 0.0
+    return float(np.median(bend)) * MAD / np.sqrt(6.0) if len(bend) else 0.0
 
 
 def _window(
@@ -173,8 +176,10 @@ def _edges(
     radius: float,
     standard: FlangeStandard,
 ) -> tuple[CircleFit, CircleFit | None, Mask, float]:
-    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and
-    the pitch of the pixels on the plane."""
+    """Fit the outer edge and the bore (None where it does not show).
+
+    Also returns the directions (sectors,) in which the outer edge is hidden, and the pitch of the pixels on the plane.
+    """
     v, u = w.x.shape[0] // 2, w.x.shape[1] // 2
     pitch = float(
         np.sqrt(
@@ -236,8 +241,10 @@ def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
 
 
 def _hidden_directions(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
-    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden,
-    by a cable, a shadow or the image's border, and what looks like an edge there is none."""
+    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower.
+
+    It is hidden, by a cable, a shadow or the image's border, and what looks like an edge there is none.
+    """
     way = -1.0 if outer else 1.0
     count = int(np.clip(2.0 * np.pi * radius / (4.0 * pitch), 18, 72))
     low, high = sorted(radius + way * d for d in (pitch, max(2.5 * pitch, min(5.0 * pitch, clear))))
@@ -257,8 +264,11 @@ def _hidden_directions(w: _Window, center: Array, radius: float, pitch: float, c
 
 
 def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, Array, Array]:
-    """Where the face ends between neighbours that both say something: places (N, 2) m, the step off the face (N, 2) m,
-    how far beyond lies above the plane (N,) m, and how far a place moves per metre that the plane is raised (N, 2)."""
+    """Where the face ends between neighbours that both say something.
+
+    Places (N, 2) m, the step off the face (N, 2) m, how far beyond lies above the plane (N,) m, and how far a place
+    moves per metre that the plane is raised (N, 2).
+    """
     width = w.x.shape[1]
     across = (w.face[:, 1:] != w.face[:, :-1]) & w.known[:, 1:] & w.known[:, :-1]
     down = (w.face[1:] != w.face[:-1]) & w.known[1:] & w.known[:-1]
@@ -404,7 +414,7 @@ def _domed(w: _Window, ring: Mask, rho2: Array, plane: PlaneFit) -> bool:
 
 
 def _thin(ring: Mask) -> tuple[slice, slice]:
-    """Every so manieth pixel along rows and columns that some thousands of a ring's remain."""
+    """Every k-th pixel along rows and columns, so that some thousands of the ring remain."""
     step = slice(None, None, max(1, int(np.sqrt(np.count_nonzero(ring) / _PLANE_POINTS) + 0.5)))
     return step, step
 

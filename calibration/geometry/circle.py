@@ -102,7 +102,9 @@ def refine_circles(
     fixed: NDArray[np.bool_] | None = None,
 ) -> list[CircleFit]:
     """Refine circles about the origin of their points (N_k, 2) [m] from radii [m] that are right to about a millimetre.
-    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
+
+    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay.
+    """
     settled = 1e-2 * noise_floor if settled is None else settled
     out = []
     for k, (edge, radius) in enumerate(zip(edges, radii, strict=True)):
@@ -123,8 +125,9 @@ def refine_circles(
 def circle_steps(
     x: Array, y: Array, radius: float, free: int, noise_floor: float, settled: float
 ) -> tuple[bool, Array, Array, float, float, NDArray[np.bool_]]:
-    """Gauss-Newton with Tukey's weights for one circle about the origin of its points x, y (N,) m; ``free`` is 2 where
-    the radius is known, else 3.
+    """Gauss-Newton with Tukey's weights for one circle about the origin of its points x, y (N,) m.
+
+    ``free`` is 2 where the radius is known, else 3.
 
     The scale is the one of the third step. Returns whether the points fix a circle, (cx, cy, r), the information J^T J
     (3, 3), the variance of psi over its mean slope squared, the rms of the inliers, and which those are (N,).
@@ -190,8 +193,10 @@ def circle_steps(
 
 
 def _covariance(d: Array, rho: Array, e: Array, s: Array, scale: float, free: int) -> Array:
-    """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi; (3, 3), zero row for a fixed
-    radius."""
+    """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi.
+
+    (3, 3), zero row for a fixed radius.
+    """
     t = e / (TUKEY * scale)
     inside = np.abs(t) < 1.0
     psi = np.where(inside, e * (1.0 - t**2) ** 2, 0.0)

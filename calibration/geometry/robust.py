@@ -71,8 +71,10 @@ def middle(a: Array) -> float:
 
 @compiled()
 def solved(N: Array, g: Array, free: int) -> tuple[bool, Array]:
-    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky; False where not positive
-    definite."""
+    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky.
+
+    False where not positive definite.
+    """
     L, x = np.zeros((3, 3)), np.zeros(3)
     for i in range(free):
         for j in range(i + 1):
@@ -110,8 +112,10 @@ def radius_95(S: Array) -> float:
 
 @compiled()
 def cross_rows(J: Array, v: NDArray[np.floating[Any]], weight: float) -> None:
-    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns; the diagonal
-    stays."""
+    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns.
+
+    The diagonal stays.
+    """
     J[0, 1], J[0, 2], J[1, 2] = weight * v[2], -weight * v[1], weight * v[0]
     J[1, 0], J[2, 0], J[2, 1] = -weight * v[2], weight * v[1], -weight * v[0]
 

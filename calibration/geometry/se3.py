@@ -56,6 +56,23 @@ def log_rotation(R: Array) -> Array:
     return np.asarray(w)
 
 
+def as_transform(X: Array) -> RigidTransform:
+    """A pose (4, 4) as RigidTransform, its rotation projected."""
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
+
+
+def angle_of(R: Array) -> Array:
+    """Angles (...) rad of rotations (..., 3, 3)."""
+    return np.asarray(np.arccos(np.clip(0.5 * (np.einsum("...ii->...", R) - 1.0), -1.0, 1.0)))
+
+
+def frames_along(z: Array) -> Array:
+    """Rotations (..., 3, 3) whose third columns are the unit vectors z (..., 3)."""
+    x = np.cross(z, np.where(np.abs(z[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
 def rotation_vector(R: RotationMatrix) -> Array:
     """Axis times angle (3,) rad of a rotation."""
     aa = R.ToAngleAxis()
@@ -99,8 +116,10 @@ def nearest_rotation(M: Array) -> Array:
 
 
 def moved(X: Array, change: Array) -> Array:
-    """X after a change (6,) [rotation; translation] on the parent's side about the child's origin: (exp(a) R, p +
-    b)."""
+    """X after a change (6,) [rotation.
+
+    Translation] on the parent's side about the child's origin: (exp(a) R, p + b).
+    """
     out = X.copy()
     out[:3, :3] = exp_rotation(change[:3]) @ X[:3, :3]
     out[:3, 3] += change[3:]
@@ -123,8 +142,10 @@ def random_rotations(n: int, rng: np.random.Generator) -> Array:
 
 
 def mean_of(poses: list[Array]) -> Array:
-    """The pose M with sum log(M^-1 X_k) = 0 on SE(3): it moves with the poses under any change of frames on either side
-    (Pennec and Arsigny 2013, bi-invariant mean)."""
+    """The pose M with sum log(M^-1 X_k) = 0 on SE(3).
+
+    It moves with the poses under any change of frames on either side (Pennec and Arsigny 2013, bi-invariant mean).
+    """
     M = poses[0]
     stack = np.array(poses)
     before = np.inf
@@ -144,8 +165,10 @@ def mean_of(poses: list[Array]) -> Array:
 
 
 def flange_poses(arm: Chain, q: Array, errors: Array) -> Array:
-    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation; translation] of each joint in
-    its own frame before it turns: the third is the joint's offset."""
+    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation.
+
+    Translation] of each joint in its own frame before it turns: the third is the joint's offset.
+    """
     X = np.broadcast_to(IDENTITY, (len(q), 4, 4))
     for i in range(arm.n):
         turn = exp_rotation(q[:, i : i + 1] * [0.0, 0.0, 1.0])
@@ -171,15 +194,19 @@ def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidT
 
 
 def fit_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array]:
-    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are
-    omitted (k <= s)."""
+    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid.
+
+    Collinear sets are omitted (k <= s).
+    """
     R, t, good = fit_all_rigid_sets(p_B, p_C)
     return R[good], t[good]
 
 
 def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Rotations (s, 3, 3), translations (s, 3) and whether they are fixed (s,) of s point sets (s, n, 3), as
-    fit_rigid."""
+    """Fit rotations (s, 3, 3) and translations (s, 3) of s point sets (s, n, 3), as fit_rigid.
+
+    The third result (s,) is whether a set fixes them.
+    """
     mean_B, mean_C = p_B.mean(axis=1), p_C.mean(axis=1)
     U, D, Vt = np.linalg.svd(np.swapaxes(p_B - mean_B[:, None], 1, 2) @ (p_C - mean_C[:, None]))
     good = (D[:, 1] >= 1e-12 * np.maximum(D[:, 0], 1e-30)) & (D[:, 0] > 0.0)
@@ -190,15 +217,30 @@ def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np
 
 @lru_cache(maxsize=64)
 def drawn_triples(n: int, count: int, seed: int) -> NDArray[np.int64]:
-    """Minimal sets (count, 3) of n points, each of three different ones; drawn once, for folds and models ask for the
-    same."""
+    """Minimal sets (count, 3) of n points, each of three different ones.
+
+    Drawn once, for folds and models ask for the same.
+    """
     rng = np.random.default_rng(seed)
     sets = np.array([rng.choice(n, 3, replace=False) for _ in range(count)])
     sets.setflags(write=False)
     return sets
 
 
+def fit_with_offset(p_B: Array, p_C: Array, R_B: Array) -> tuple[Array, Array, Array]:
+    """R_BC (3, 3), p_BC (3,) and b (3,) of R_BC p_C + p_BC = p_B + R_B b, the rotation's nine numbers free.
+
+    So an offset b of any size in the frames R_B (n, 3, 3) is linear; points (n, 3) m, n >= 6.
+    """
+    n = len(p_C)
+    A = np.zeros((n, 3, 15))
+    for k in range(3):
+        A[:, k, 3 * k : 3 * k + 3] = p_C
+    A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -R_B
+    x = np.asarray(np.linalg.lstsq(A.reshape(-1, 15), p_B.ravel(), rcond=1e-9)[0], dtype=float)
+    return nearest_rotation(x[:9].reshape(3, 3)), x[9:12], x[12:]
+
+
 def fit_rotation(u_B: Array, u_C: Array) -> RotationMatrix:
     """R_BC minimising the sum of |u_B - R_BC u_C|^2 for vectors (N, 3); two that are not parallel suffice."""
-    U, _, Vt = np.linalg.svd(u_B.T @ u_C)
-    return RotationMatrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return RotationMatrix(nearest_rotation(u_B.T @ u_C))

@@ -48,8 +48,10 @@ focal length of 1,200."""
 
 @dataclass(frozen=True, kw_only=True)
 class EquationFit:
-    """A converged fit. ``w``, ``d`` (n, 3): residuals; ``scaled``, ``lin``: normal equations and derivatives of the
-    observations kept."""
+    """A converged fit.
+
+    ``w``, ``d`` (n, 3): residuals; ``scaled``, ``lin``: normal equations and derivatives of the observations kept.
+    """
 
     state: State
     noise: Noise
@@ -275,8 +277,9 @@ def solve(
 
 
 def _concentrated(problem: Problem, state: State) -> State:
-    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise
-    that they cause.
+    """The state of the poses that agree best, where some may be outliers.
+
+    Few outliers of few poses hide in the noise that they cause.
 
     Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers
     for each unknown are not trimmed.

@@ -20,14 +20,16 @@ _OPEN_SIGMA = 10.0  # what the covariance says of an open direction, in the same
 
 @dataclass(frozen=True)
 class Diversity:
-    """How the poses differ: n and distinct; largest turn (deg) between poses; spread (deg) of the turns along their
-    three principal directions; spread of positions in units of length; smallest share of the turn off the main axis."""
+    """How the poses differ: n and distinct; largest turn (deg) between poses.
+
+    Spread (deg) of the turns along their three principal directions; spread of positions in units of length; smallest
+    share of the turn off the main axis.
+    """
 
     n: int
     distinct: int
     turn_deg: float
     turn_spread_deg: tuple[float, float, float]
-    position_spread: tuple[float, float, float]
 
     def sentence(self) -> str:
         """One line for an operator."""
@@ -53,13 +55,12 @@ def diversity(problem: Problem) -> Diversity:
     places = np.linalg.svd(p, compute_uv=False) / np.sqrt(len(p))
     first = [log_rotation(X[:, :3, :3] @ X[0, :3, :3].T) for X in stated]
     largest = max(float(np.linalg.norm(v, axis=1).max()) for v in first)
-    s, q = np.degrees(spread), places
+    s = np.degrees(spread)
     return Diversity(
         n,
         _distinct(stated, float(np.sqrt((places**2).sum()))),
         float(np.degrees(largest)),
         (float(s[0]), float(s[1]), float(s[2])),
-        (float(q[0]), float(q[1]), float(q[2])),
     )
 
 
@@ -136,8 +137,10 @@ def _check_points(p: Array, allow_coplanar: bool) -> None:
 
 @dataclass(frozen=True)
 class Determinacy:
-    """Directions of the unknowns (m,) that stay open, their names, sentences on vague ones, and the condition number of
-    the scaled information."""
+    """Directions of the unknowns (m,) that stay open, with their names.
+
+    Besides: sentences on vague directions, and the condition number of the scaled information.
+    """
 
     directions: tuple[Array, ...]
     names: tuple[str, ...]

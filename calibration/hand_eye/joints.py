@@ -47,8 +47,10 @@ _SHOWN = 0.8  # of the prior: below it the poses have said something
 
 @dataclass(frozen=True)
 class JointPrior:
-    """Prior of a robot's errors: standard deviations of the zero of a joint, of the turn of a joint's
-    axis, and of its place."""
+    """Prior of a robot's errors.
+
+    Standard deviations of the zero of a joint, of the turn of a joint's axis, and of its place.
+    """
 
     offset_rad: float = float(np.radians(0.3))
     turn_rad: float = float(np.radians(0.1))
@@ -120,8 +122,9 @@ def refine_joints(
     prior: JointPrior | None = None,
     config: HandEyeConfig | None = None,
 ) -> JointRefinement:
-    """Estimate joint offsets (``kind`` "joints") or all errors of the links ("links": six numbers a joint) with the
-    camera.
+    """Estimate joint offsets, or all errors of the links, with the camera.
+
+    ``kind`` is "joints" or "links", which are six numbers a joint.
 
     Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as
     a whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and
@@ -187,8 +190,9 @@ def refine_joints(
 
 
 def poses_of_arm(pairs: PosePairs, arm: Chain) -> PosePairs:
-    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles; a constant
-    tool stays.
+    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles.
+
+    A constant tool stays.
 
     Raises as refine_joints does.
     """
@@ -315,8 +319,10 @@ def _by_errors(robot: _Robot, state: State, k: int, centre: Array, u: Array) -> 
 def _held_out(
     robot: _Robot, state: State, keep: NDArray[np.bool_], k: int, *, centre: Array, label: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold; ``label`` (n,): the
-    folds."""
+    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold.
+
+    ``label`` (n,): the folds.
+    """
     w, d = np.full(len(keep), np.nan), np.full(len(keep), np.nan)
     for fold in range(int(label.max()) + 1):
         test = label == fold

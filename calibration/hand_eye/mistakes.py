@@ -1,5 +1,7 @@
-"""Name the usual mistakes in pairs of poses: in whole lists, in single rows, and in the scale of the camera's
-distances."""
+"""Name the usual mistakes in pairs of poses.
+
+In whole lists, in single rows, and in the scale of the camera's distances.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,8 +59,10 @@ def likely_mistake(pairs: PosePairs) -> str | None:
 
 
 def _solvable(one: ReadingAgreement, mode: str) -> bool:
-    """Whether the solver finds a result, where a quarter of outliers or more hides from the comparison that a reading
-    agrees."""
+    """Test whether the solver finds a result.
+
+    A quarter of outliers or more hides from the comparison that a reading agrees.
+    """
     F = one.robot.X if mode == "eye_in_hand" else inverse(one.robot.X)
     try:
         solve_problem(
@@ -195,9 +199,11 @@ def _listed(pairs: PosePairs, rows: Sequence[int]) -> str:
 
 
 def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
-    """A sentence where the robot's motion says that all camera distances are too long or too short by one factor (a
-    target of another size, a wrong focal length): such an error shifts the answer without showing in any
-    reprojection."""
+    """Warn where the robot's motion shows that all camera distances are too long or too short by one factor.
+
+    Causes are a target of another size, or a wrong focal length. Such an error shifts the answer without showing in any
+    reprojection.
+    """
     # repeats say nothing more about the scale than one sample does
     used = one_per_pose(problem).problem.pick(np.unique(result.observation[result.inliers]))
     if problem.tied or not used.all_full or 6 * len(used) < problem.size + 12 or result.unobservable:

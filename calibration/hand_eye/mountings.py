@@ -51,7 +51,10 @@ def _unknown(symbol: str, child: tuple[str, str], parent: tuple[str, str]) -> Un
 
 _CAMERA = ("camera", "camera_optical_frame")
 _BASE = ("base", "base")
-_HAND = ("flange", "flange")
+_HAND = (
+    "flange",
+    "tool0",
+)  # of ROS-Industrial: z along the flange's normal, as controllers count; REP 199's "flange" has x there
 _TARGET = ("target", "target")
 _LINK = ("arm link", "arm_link")
 
@@ -100,9 +103,9 @@ MOUNTINGS: dict[str, Mounting] = {
             "X_BF X_FC X_CM = X_BD X_DE X_EM",
             "paper, Eq. (5), Fig. 2c",
             {
-                "X": _unknown("X_FC", _CAMERA, ("first robot's flange", "robot1_flange")),
+                "X": _unknown("X_FC", _CAMERA, ("first robot's flange", "robot1_tool0")),
                 "Y": _unknown("X_BD", ("second robot's base", "robot2_base"), ("first robot's base", "robot1_base")),
-                "Z": _unknown("X_EM", _TARGET, ("second robot's flange", "robot2_flange")),
+                "Z": _unknown("X_EM", _TARGET, ("second robot's flange", "robot2_tool0")),
             },
             "base B --X_BF(robot 1)--> flange F ==X_FC==> camera C --X_CM(seen)--> target M\n"
             "base B ==X_BD==> second base D --X_DE(robot 2)--> second flange E ==X_EM==> target M",

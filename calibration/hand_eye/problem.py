@@ -248,8 +248,10 @@ class Loss(Enum):
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise
-    centre."""
+    """Variances per axis beyond the observations' own covariances.
+
+    Rotation rad^2 and translation of the noise centre.
+    """
 
     rotation: float
     translation: float
@@ -314,8 +316,9 @@ class Scaled:
         return np.asarray(-self._newton() @ (self.gw + self.gd))
 
     def _marginal(self, usual: float) -> tuple[float, Array, Array]:
-        """The discord whose information is the mean over its likelihood, and the means over it of what the gradients
-        (m,) of rotations and of displacements move (m, m).
+        """Return the discord whose information is the mean over its likelihood, with means over that likelihood.
+
+        They are of what the gradients (m,) of rotations and of displacements move (m, m).
 
         At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are
         the best for these rotations and the displacements as measured: so they predict them best.
@@ -373,8 +376,10 @@ class Scaled:
         return e, self.root @ np.concatenate([lin.Jw, lin.Jd], axis=1)
 
     def variances(self, lin: Linearised, noise: Noise, floor: float) -> Noise:
-        """The variances that make each group's weighted squares equal to its redundancy (one Newton step in the
-        log)."""
+        """The variances that make each group's weighted squares equal to its redundancy.
+
+        One Newton step in the log.
+        """
         if self.root is None:
             qw = np.einsum("ij,ij->i", lin.w, lin.w) / noise.rotation
             qd = np.einsum("ij,ij->i", lin.d, lin.d) / noise.translation
@@ -471,8 +476,10 @@ def inverse_information(N: Array) -> Array:
 
 
 def _sure_inverse(N: Array) -> Array | None:
-    """Inverse of a matrix that is plainly positive definite, by its Cholesky factor; None where eigenvalues must
-    decide."""
+    """Inverse of a matrix that is plainly positive definite, by its Cholesky factor.
+
+    None where eigenvalues must decide.
+    """
     try:
         L = np.linalg.cholesky(N)
     except np.linalg.LinAlgError:

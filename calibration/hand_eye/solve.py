@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
-from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD, solve
+from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, difference, inverse
+from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD, Choice, solve
 from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
     check_poses,
@@ -51,8 +51,11 @@ class HandEyeConfig:
 
 @dataclass(frozen=True)
 class HandEyeHeldOut:
-    """Errors (n,) of each pose under a calibration that never saw its fold: rotation rad, translation in the unit of
-    the data; NaN where a fold could not be solved. rms over poses as the properties say."""
+    """Errors (n,) of each pose under a calibration that never saw its fold.
+
+    Rotation rad, translation in the unit of the data; NaN where a fold could not be solved. rms over poses as the
+    properties say.
+    """
 
     rotation_rad: Array
     translation: Array
@@ -122,8 +125,10 @@ class HandEyeResult:
         return float(e @ np.linalg.solve(self.covariance[name], e))
 
     def region(self, share: float = 0.95) -> float:
-        """Bound on ``normalised_error`` that holds the truth with this probability: Hotelling's, since the noise was
-        estimated from as many residuals as ``degrees_of_freedom`` says."""
+        """Bound on ``normalised_error`` that holds the truth with this probability.
+
+        Hotelling's, since the noise was estimated from as many residuals as ``degrees_of_freedom`` says.
+        """
         return float(6.0 * f_quantile(share, 6.0, self.degrees_of_freedom))
 
 
@@ -211,14 +216,7 @@ def solve_problem(
     diverse = check_poses(problem, allow_coplanar=config.allow_coplanar)
     samples, repeats = problem, one_per_pose(problem, known, join=config.join_repeats)
     problem, observation = repeats.problem, repeats.observation
-    choice = solve(
-        problem,
-        known,
-        seed=config.seed,
-        starts=starts,
-        max_outliers=config.max_outliers,
-        usual_discord=config.usual_discord_rad,
-    )
+    choice = _choice(problem, known, config, starts)
     keep = choice.fit.keep
     used = problem if keep.all() else problem.pick(keep)
     if not keep.all():
@@ -283,6 +281,11 @@ def solve_problem(
     )
 
 
+def _choice(problem: Problem, known: State, config: HandEyeConfig, starts: tuple[State, ...]) -> Choice:
+    outliers, discord = config.max_outliers, config.usual_discord_rad
+    return solve(problem, known, seed=config.seed, starts=starts, max_outliers=outliers, usual_discord=discord)
+
+
 def _refuse_open(
     problem: Problem, directions: tuple[Array, ...], names: tuple[str, ...], config: HandEyeConfig
 ) -> None:
@@ -318,14 +321,7 @@ def _held_out(
             continue
         try:
             check_poses(problem.pick(train), allow_coplanar=config.allow_coplanar)
-            choice = solve(
-                problem.pick(train),
-                known,
-                seed=config.seed,
-                starts=starts,
-                max_outliers=config.max_outliers,
-                usual_discord=config.usual_discord_rad,
-            )
+            choice = _choice(problem.pick(train), known, config, starts)
         except WeldcalError:
             continue
         rest = samples.pick(test)
@@ -404,11 +400,6 @@ def _covariances(value: ArrayLike | None, n: int) -> Array | None:
 def _same_length(a: Array, b: Array) -> None:
     if len(a) != len(b):
         raise InputError(f"There are {len(a)} robot poses and {len(b)} camera poses; give one of each per sample.")
-
-
-def as_transform(X: Array) -> RigidTransform:
-    """A pose (4, 4) as RigidTransform, its rotation projected."""
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
 def _nothing(n: int) -> HandEyeHeldOut:

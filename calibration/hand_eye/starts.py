@@ -16,8 +16,10 @@ _CUBE: Array = np.asarray(Rotation.create_group("O").as_matrix())
 
 
 def motions(problem: Problem, state: State) -> tuple[Array, Array]:
-    """Relative motions P_k X = X Q_k (k, 4, 4) each, of a problem whose Z is known: A_i X = Y B_i gives
-    A_i^-1 A_j X = X B_i^-1 B_j with A = F, B = H Z G^-1."""
+    """Relative motions P_k X = X Q_k (k, 4, 4) each, of a problem whose Z is known.
+
+    A_i X = Y B_i gives A_i^-1 A_j X = X B_i^-1 B_j with A = F, B = H Z G^-1.
+    """
     A, B = problem.F, (problem.H @ state[2]) @ inverse(problem.G)
     if problem.tied:
         return A, B
@@ -180,8 +182,10 @@ def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
 
 
 def grid(problem: Problem, state: State, rng: np.random.Generator, n: int = 24) -> list[tuple[str, State]]:
-    """Turns of the cube, seen from a random side, for X; the rotations of the other unknowns follow from the
-    observations where these are poses, or stay as they are."""
+    """Turns of the cube, seen from a random side, for X.
+
+    The rotations of the other unknowns follow from the observations where these are poses, or stay as they are.
+    """
     tilt = np.asarray(Rotation.random(rng=rng).as_matrix())
     out = []
     for k in range(n):

@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset, RobotStream
+from weldcal.calibration.geometry.robust import MAD
+from weldcal.calibration.geometry.se3 import as_transform, frames_along
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import ArmModel, link_frames
@@ -43,8 +45,10 @@ pairs = o3d.pipelines.registration
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A body's surface in its own frame L: points (n, 3) m, outward unit normals (n, 3), and the middle (3,) m of the
-    points."""
+    """A body's surface in its own frame L.
+
+    Points (n, 3) m, outward unit normals (n, 3), and the middle (3,) m of the points.
+    """
 
     points: Array
     normals: Array
@@ -83,8 +87,10 @@ def model_from_solids(solids: Sequence[TriMesh], *, seed: int = 0) -> BodyModel:
 
 
 def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, radius_m: float) -> BodyModel:
-    """Fuse scans to the surface of what moves with a frame L: ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the
-    pose X_LC by calibration and robot. Only points within ``radius_m`` of ``middle`` (3,) m in L count.
+    """Fuse scans to the surface of what moves with a frame L.
+
+    ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the pose X_LC by calibration and robot. Only points within
+    ``radius_m`` of ``middle`` (3,) m in L count.
 
     A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that half of the frames saw: what stands
     still or belongs to another link sweeps through the voxels. Raises InputError where too little is left.
@@ -136,8 +142,10 @@ def _scene(mesh: TriMesh) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class TrackedBody:
-    """Pose X_CL of a body in a scan, its covariance (6, 6) [rotation; translation] in axes of C about the body's
-    middle, the rms distance (m) and the number of the points on its surface."""
+    """Pose X_CL of a body in a scan, its covariance (6, 6) [rotation.
+
+    Translation] in axes of C about the body's middle, the rms distance (m) and the number of the points on its surface.
+    """
 
     X_CL: RigidTransform
     covariance: Array
@@ -190,7 +198,7 @@ class BodyTracker:
         q = p_C @ X_LC[:3, :3].T + X_LC[:3, 3]
         n = self.model.normals[index]
         e = ((q - self.model.points[index]) * n).sum(axis=1)
-        limit = 3.0 * 1.4826 * float(np.median(np.abs(e))) + 1e-5
+        limit = 3.0 * MAD * float(np.median(np.abs(e))) + 1e-5
         good = np.abs(e) < limit
         rms = float(np.sqrt(np.mean(e[good] ** 2)))
         if rms > _WORST_RMS_M:
@@ -203,13 +211,13 @@ class BodyTracker:
         R = X_LC[:3, :3].T
         turn = np.kron(np.eye(2), R)
         covariance = turn @ (np.linalg.inv(N) * rms**2 * _CORRELATED) @ turn.T
-        R_LC = RotationMatrix.ProjectToRotationMatrix(X_LC[:3, :3])
-        return TrackedBody(RigidTransform(R_LC, X_LC[:3, 3]).inverse(), covariance, rms, int(good.sum()))
+        return TrackedBody(as_transform(X_LC).inverse(), covariance, rms, int(good.sum()))
 
 
 def link_motion(stream: RobotStream, arm: ArmModel, link: int) -> ContinuousMotion:
-    """Continuous motion of a link (its index in ``arm.link_names``) from a stream of joints; of the last link also from
-    poses.
+    """Continuous motion of a link (its index in ``arm.link_names``) from a stream of joints.
+
+    Of the last link also from poses.
 
     Raises InputError: the stream has no joints, and the link is not the last.
     """
@@ -227,10 +235,7 @@ def link_motion(stream: RobotStream, arm: ArmModel, link: int) -> ContinuousMoti
 def observed_point(model: BodyModel, X_CL: RigidTransform) -> RigidTransform:
     """Pose X_LR of the point that is observed on a body: its middle, z towards a scanner that sees the body at X_CL."""
     z = X_CL.inverse().translation() - model.middle
-    z = z / np.linalg.norm(z)
-    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
-    x /= np.linalg.norm(x)
-    return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), model.middle)
+    return RigidTransform(RotationMatrix(frames_along(z / np.linalg.norm(z))), model.middle)
 
 
 def see_body(
@@ -242,8 +247,10 @@ def see_body(
     *,
     tell: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[ObservedFrames, RigidTransform, list[tuple[str, str]]]:
-    """Track a body through a recording: its middle and one of its directions as observations, their place X_LR on the
-    body, and (id, reason) of frames without it.
+    """Track a body through a recording.
+
+    Its middle and one of its directions as observations, their place X_LR on the body, and (id, reason) of frames
+    without it.
 
     ``motion`` is the body's by the robot; ``delay_s`` is about how long before its arrival a frame was captured. The
     next frame is looked for where the robot and the frame before say. Raises InputError where no frame shows the body.
@@ -259,7 +266,7 @@ def see_body(
         if not np.isfinite(X_BL).all():
             refused.append((frame.id, "The robot's stream has no data at its capture."))
             continue
-        predicted = X_BC.inverse() @ _rigid(X_BL)
+        predicted = X_BC.inverse() @ as_transform(X_BL)
         guess = (
             predicted
             if last is None
@@ -297,7 +304,3 @@ def _observed(found: Sequence[tuple[FrameTime, TrackedBody]], X_LR: RigidTransfo
         covariance=np.array([t.covariance[3:, 3:] for _, t in found]),
         normal_sigma=np.array([float(np.sqrt(np.trace(t.covariance[:3, :3]) / 3.0)) for _, t in found]),
     )
-
-
-def _rigid(X: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, frames_along, skew
 from weldcal.calibration.motion.observed import FrameClock, ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
@@ -52,8 +52,10 @@ _PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2] + [0.0] * 5)  # information: edges 
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter``
-    s^2."""
+    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis.
+
+    ``jitter`` s^2.
+    """
 
     factor: float
     spread: float
@@ -68,8 +70,11 @@ class Variances:
 
 @dataclass(eq=False)
 class LinearisedStream:
-    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5),
-    Jacobians J (N, 5, 15), rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
+    """The model linearised at the frames' capture times.
+
+    Residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 15), rates g (N, 5) and the unit
+    covariances of the three kinds of noise in 5 x 5.
+    """
 
     y: Array
     J: Array
@@ -172,8 +177,6 @@ class ClockFit:
     centre: Array
     lean: Array
     rates: Array
-    jitters: Array
-    jitter_variance: Array
     jacobian: Array
     weights: Array
     X_FR: RigidTransform | None = None
@@ -201,8 +204,10 @@ class MotionProblem:
     def residuals(
         self, X: RigidTransform, t: Array, rolling: float, edge: float
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """Residuals e (N, 3), m (N, 2) and rates v (N, 3), turn (N, 2) at times t, and the tangents A (N, 3, 2) of the
-        normal."""
+        """Return residuals e (N, 3) and m (N, 2), rates v (N, 3) and turn (N, 2) at times t.
+
+        Also returns the tangents A (N, 3, 2) of the normal.
+        """
         f = self.frames
         at = self.motion.feature(t, self.X_FR)
         R = X.rotation().matrix()
@@ -211,7 +216,7 @@ class MotionProblem:
         if rolling:
             # rows exposed at different times shear the face and lean its normal
             n = n + (rolling / f.p_C[:, 2] * (at.v * at.n).sum(axis=1))[:, None] * R[:, 1]
-        A = _tangents(at.n)
+        A = frames_along(at.n)[:, :, :2]
         m = np.einsum("nij,ni->nj", A, n - at.n)
         return e, m, at.v, np.einsum("nij,ni->nj", A, at.turn), A
 
@@ -288,11 +293,6 @@ def fit_clock(
         if step_number > (6 if after is None else 3) and small and change < 3e-3 and settled_sets:
             break
     assert linear is not None
-    g = linear.g
-    P = noise_covariances(linear, variances)
-    Pg = np.linalg.solve(P, g[:, :, None])[:, :, 0]
-    a = np.maximum((g * Pg).sum(axis=1), 1e-12)
-    jitters = (Pg * linear.y).sum(axis=1) / a
     e, m, v, _, _ = problem.residuals(X_BC, capture, rolling, edge)
     return ClockFit(
         X_BC=X_BC,
@@ -311,8 +311,6 @@ def fit_clock(
         centre=e,
         lean=m,
         rates=v,
-        jitters=jitters,
-        jitter_variance=1.0 / a,
         jacobian=linear.J[:, :, index],
         weights=W,
         X_FR=problem.X_FR,
@@ -325,19 +323,13 @@ def _solved(N: Array, b: Array) -> Array:
     return np.asarray(np.linalg.pinv(N / np.outer(d, d), rcond=1e-11, hermitian=True) @ (b / d) / d)
 
 
-def _tangents(n: Array) -> Array:
-    """Two unit vectors (N, 3, 2) at right angles to normals n (N, 3)."""
-    other = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(n, other)
-    x /= np.linalg.norm(x, axis=1)[:, None]
-    return np.stack([x, np.cross(n, x)], axis=2)
-
-
 def _first_variances(
     problem: MotionProblem, X: RigidTransform, nominal: Array, allowed: Flags
 ) -> tuple[Variances, Flags]:
-    """Variances from medians of the start's residuals, across and along the motion, and the frames that agree with
-    them."""
+    """Take variances from medians of the start's residuals, and the frames that agree with them.
+
+    The residuals are across and along the motion.
+    """
     e, m, v, _, _ = problem.residuals(X, nominal, 0.0, 0.0)
     speed = np.linalg.norm(v, axis=1)
     fast = allowed & (speed > 0.3 * float(np.nanmax(np.where(allowed, speed, 0.0), initial=0.0))) & (speed > 1e-3)
@@ -409,8 +401,11 @@ def _polished_capture(
 def linearised(
     problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
 ) -> LinearisedStream:
-    """The model at capture times (N,) s: residuals extrapolated to the nominal times, and their derivatives by all
-    unknowns. ``rolling`` s, ``edge`` in noises of the face, rotations about ``pivot`` (3,) m."""
+    """The model at capture times (N,) s.
+
+    Residuals extrapolated to the nominal times, and their derivatives by all unknowns. ``rolling`` s, ``edge`` in
+    noises of the face, rotations about ``pivot`` (3,) m.
+    """
     f = problem.frames
     e, m, v, turn, A = problem.residuals(X, capture, rolling, edge)
     R = X.rotation().matrix()

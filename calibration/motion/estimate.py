@@ -29,9 +29,10 @@ _MOST = 900  # frames whose pairs are looked at
 
 @dataclass(frozen=True, eq=False)
 class PlaceErrors:
-    """Errors that depend on the place: ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal,
-    correlated over ``length_m``; ``found`` whether they are significant; ``meat`` (K, K): covariance of the fit's
-    scores that they add.
+    """Errors that depend on the place.
+
+    ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal, correlated over ``length_m``; ``found``
+    whether they are significant; ``meat`` (K, K): covariance of the fit's scores that they add.
     """
 
     found: bool
@@ -100,8 +101,10 @@ def find_place_errors(fit: ClockFit, frames: ObservedFrames) -> PlaceErrors:
 
 
 def _covariogram(d: Array, products: Array, share: Array) -> tuple[float, float] | None:
-    """Variance and length of the correlated error from products of residuals (P,) at distances d (P,); None where there
-    is none."""
+    """Variance and length of the correlated error from products of residuals (P,) at distances d (P,).
+
+    None where there is none.
+    """
     near = d < _NEAR_M
     if np.count_nonzero(near) < 20:
         return None
@@ -159,7 +162,7 @@ class MotionEstimate:
     offset (s), drift, rolling (s) as far as ``names`` lists them. ``clock`` what was found of it. ``inliers`` (N,)
     frames used; ``capture`` (N,) s their most probable capture times on the robot's clock; ``residual_m`` (N,) distance
     of the centres there, ``along_m`` (N,) along the motion at the time that the clock says, ``before_m`` (N,) the same
-    if arrivals are taken for captures (X_BC fitted so), ``tilt_rad`` (N,); ``held_out_m``, ``held_out_along_m``,
+    if arrivals are taken for captures (X_BC fitted so), ``tilt_rad`` (N,); ``held_out_m``,
     ``held_out_tilt_rad`` (N,) from fits without the frame's own block of time. ``speed`` (N,) m/s.
     """
 
@@ -179,7 +182,6 @@ class MotionEstimate:
     before_m: Array
     tilt_rad: Array
     held_out_m: Array
-    held_out_along_m: Array
     held_out_tilt_rad: Array
     unobservable: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -264,7 +266,7 @@ def estimate_in_motion(
     kept = [k for k, name in enumerate(fit.free) if name < EDGE]
     joint = 0.5 * (joint + joint.T)[np.ix_(kept, kept)]
     names = tuple(_NAMES[fit.free[k]] for k in kept)
-    held = _held_out(frames, clock, motion, fit, fit.X_FR) if held_out else (np.full(len(frames), np.nan),) * 3
+    held = _held_out(frames, clock, motion, fit, fit.X_FR) if held_out else (np.full(len(frames), np.nan),) * 2
     before, speed, along = _along(frames, clock, motion, fit, start, fit.X_FR)
     return MotionEstimate(
         X_BC=fit.X_BC,
@@ -283,8 +285,7 @@ def estimate_in_motion(
         before_m=before,
         tilt_rad=np.linalg.norm(fit.lean, axis=1),
         held_out_m=held[0],
-        held_out_along_m=held[1],
-        held_out_tilt_rad=held[2],
+        held_out_tilt_rad=held[1],
         unobservable=tuple(told),
         warnings=tuple(said),
     )
@@ -360,8 +361,7 @@ def _inverse(information: Array, free: tuple[int, ...]) -> tuple[Array, Array]:
 
 
 def _determined(fit: ClockFit, places: PlaceErrors) -> tuple[Array, tuple[str, ...], list[tuple[str, str]]]:
-    """Covariance of the unknowns about the pivot, names of those that the motion leaves open, and those it shows
-    weakly."""
+    """Return the covariance of the unknowns about the pivot, and names of those that the motion leaves open or weak."""
     inverse, _ = _inverse(fit.information, fit.free)
     inverse = inverse + places.excess(inverse)
     sigma = np.sqrt(np.diag(inverse))
@@ -417,14 +417,16 @@ def _along(
 
 def _held_out(
     frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, fit: ClockFit, X_FR: RigidTransform | None
-) -> tuple[Array, Array, Array]:
-    """Errors (N,) of each frame by a fit without its own block of time: of the centre (m) at its most probable capture
-    time, along the motion (m) at the clock's time, and of the normal (rad)."""
+) -> tuple[Array, Array]:
+    """Errors (N,) of each frame by a fit without its own block of time.
+
+    Of the centre (m) at its most probable capture time, and of the normal (rad).
+    """
     n = len(frames)
-    position, along, tilt = (np.full(n, np.nan) for _ in range(3))
+    position, tilt = np.full((2, n), np.nan)
     used = np.flatnonzero(fit.keep)
     if len(used) < 2 * _FOLDS:
-        return position, along, tilt
+        return position, tilt
     for block in np.array_split(used, _FOLDS):
         keep = fit.keep.copy()
         keep[block] = False
@@ -437,11 +439,6 @@ def _held_out(
         _, variances = _inverse(without.information, without.free)
         if variances.max() > 1.0:
             continue  # this block alone shows what the others leave open
-        at = motion.feature(without.nominal[block], X_FR)
-        R = without.X_BC.rotation().matrix()
-        e = _corrected(frames, without)[block] @ R.T + without.X_BC.translation() - at.p
-        speed = np.linalg.norm(at.v, axis=1)
         position[block] = np.linalg.norm(without.centre[block], axis=1)
-        along[block] = np.where(speed > 1e-3, (e * at.v).sum(axis=1) / np.maximum(speed, 1e-3), np.nan)
         tilt[block] = np.linalg.norm(without.lean[block], axis=1)
-    return position, along, tilt
+    return position, tilt

@@ -25,9 +25,11 @@ _LARGEST = 1e6  # sigmas beyond this are of directions that the motion does not 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again: each trapezoidal in one path
-    parameter, straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those of the paths of the
-    flange."""
+    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again.
+
+    Each trapezoidal in one path parameter, straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those
+    of the paths of the flange.
+    """
 
     q: Array
     poses: Array
@@ -106,9 +108,12 @@ def recorded_stream(
 
 @dataclass(frozen=True)
 class PredictedSigma:
-    """What a motion is expected to tell, one sigma: ``work_m`` of a point among the flange's places (3-D), ``turn_rad``
-    of X_BC's rotation (3-D), ``offset_s`` of the clock, ``shared`` the largest correlation 0..1 of the offset with a
-    shift of the scanner. Infinite where the motion does not show it."""
+    """What a motion is expected to tell, one sigma.
+
+    ``work_m`` of a point among the flange's places (3-D), ``turn_rad`` of X_BC's rotation (3-D), ``offset_s`` of the
+    clock, ``shared`` the largest correlation 0..1 of the offset with a shift of the scanner. Infinite where the motion
+    does not show it.
+    """
 
     work_m: float
     turn_rad: float
@@ -126,8 +131,9 @@ def expected_of_motion(
     jitter_s: float = 0.015,
     X_FR: RigidTransform | None = None,
 ) -> PredictedSigma:
-    """Expected sigmas of a calibration from a planned motion, with a frame every ``frame_s``, as the joint fit would
-    state them.
+    """Predict the sigmas of a calibration from a planned motion, with a frame every ``frame_s``.
+
+    They are as the joint fit would state them.
 
     ``jitter_s`` is that of the arrivals; for device times give their own, 0.0001 for instance. Raises InputError: less
     than six frames.

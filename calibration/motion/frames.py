@@ -1,5 +1,7 @@
-"""Fits the flange in every frame of a recording: a search in some frames, then near where the robot's stream says it
-is."""
+"""Fits the flange in every frame of a recording.
+
+a search in some frames, then near where the robot's stream says it is.
+"""
 
 from collections import Counter
 from collections.abc import Callable
@@ -34,8 +36,10 @@ Tell = Callable[[float], None]
 
 
 class FittedFrames:
-    """Fits of the frames of a recording: ``observed`` as arrays, ``fits`` by id, and (id, reason) of those
-    ``refused``."""
+    """Fits of the frames of a recording.
+
+    ``observed`` as arrays, ``fits`` by id, and (id, reason) of those ``refused``.
+    """
 
     def __init__(self, data: MotionDataset) -> None:
         self.fits: dict[str, FlangeFit] = {}
@@ -72,8 +76,10 @@ def fit_covariance(fit: FlangeFit) -> Array:
 
 
 def _slant(fit: FlangeFit) -> Array:
-    """How far a centre (3,) moves across the face per metre that its edges are taken too low: the line of sight slides
-    along the face."""
+    """How far a centre (3,) moves across the face per metre that its edges are taken too low.
+
+    The line of sight slides along the face.
+    """
     view = fit.center_C / np.linalg.norm(fit.center_C)
     along = float(view @ fit.normal_C)
     return np.asarray((view - along * fit.normal_C) / max(abs(along), 0.1))
@@ -196,8 +202,10 @@ def _place(
 
 
 def _scattered(n: int) -> Array:
-    """Ranks (n,) that visit a row of n things evenly from the first few on (van der Corput's sequence by the golden
-    ratio)."""
+    """Ranks (n,) that visit a row of n things evenly from the first few on.
+
+    Van der Corput's sequence by the golden ratio.
+    """
     return np.asarray(np.mod(np.arange(n) * 0.6180339887498949, 1.0))
 
 

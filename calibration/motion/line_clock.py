@@ -1,5 +1,6 @@
 """Finds a laser profiler's clock offset from one straight edge that it crosses while the arm moves to and fro."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +20,11 @@ _BLOCK_S = 0.5  # within which errors are common: the edge is not straight, the 
 
 @dataclass(frozen=True, eq=False)
 class LineClock:
-    """``offset_s``: the profile's stamp less the robot's time of the same instant, and its standard deviation
-    ``sigma_s``; a ``point`` (3,) m and the ``direction`` (3,) of the edge in the base; ``rms_m`` the points' distance
-    from it, and ``before_m`` at offset zero.
+    """A profiler's clock offset, and the edge that showed it.
+
+    ``offset_s`` is the profile's stamp less the robot's time of the same instant, ``sigma_s`` its standard deviation.
+    The edge has a ``point`` (3,) m and a ``direction`` (3,) in the base. ``rms_m`` is the points' distance from it,
+    ``before_m`` that at offset zero.
     """
 
     offset_s: float
@@ -76,20 +79,9 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
         scale = MAD * float(np.median(np.abs(flat(x) * scale))) + 1e-9
         unit = np.array([scale] * 4 + [1e-3])
         x = least_squares(flat, x, loss="soft_l1", f_scale=_SOFT, x_scale=unit).x
-    steps = np.diag([scale] * 4 + [1e-3])
-    J = np.stack([(flat(x + h) - flat(x - h)) / (2.0 * h.sum()) for h in steps], axis=1)
-    r = flat(x)
-    w = 1.0 / np.sqrt(1.0 + (r / _SOFT) ** 2)
-    unit = np.diag(steps)
-    N = (J * unit).T @ (w[:, None] * J * unit)
-    inverse = np.linalg.pinv(N, rcond=1e-12, hermitian=True)
-    scores = ((J * unit) * (w * r)[:, None]).reshape(len(time), 2, 5).sum(axis=1)
-    block = ((time - time[0]) / _BLOCK_S).astype(int)
-    sums = np.array([scores[block == b].sum(axis=0) for b in np.unique(block)])
-    sandwich = max(float(((s @ inverse)[:, 4] ** 2).sum()) for s in (sums, scores))
-    sigma = 1e-3 * np.sqrt(max(sandwich, float(inverse[4, 4])))
+    sigma = max(offset_sigma(flat, x, unit, time, _SOFT, _BLOCK_S))
     offset = start + float(x[4])
-    if sigma > _OPEN_S or abs(offset) > _WIDEST_S - 2.0 * _STEP_S or float(N[4, 4]) < 1e-6:
+    if sigma > _OPEN_S or abs(offset) > _WIDEST_S - 2.0 * _STEP_S:
         raise UndeterminedPoses(
             "The motion does not show the profiler's clock offset: cross the edge to and fro, so that the velocity"
             " across it changes its sign."
@@ -98,6 +90,35 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
     rms = float(np.sqrt(np.mean(np.sum((residuals(x) * scale) ** 2, axis=1))))
     before = float(np.sqrt(np.mean(_distances(placed(0.0)) ** 2)))
     return LineClock(offset, float(sigma), a, b / np.linalg.norm(b), rms, before)
+
+
+def offset_sigma(
+    f: Callable[[Array], Array], x: Array, unit: Array, time: Array, soft: float, block_s: float
+) -> tuple[float, float]:
+    """Standard deviation of the last unknown of a soft-L1 fit, with errors that are common within blocks of time.
+
+    Args:
+        f: residuals, those of each of the times (n,) s one after the other, in sigmas, of the unknowns x (K,).
+        unit: (K,) sizes of the unknowns, for differences; soft: residual from which on they count less.
+        block_s: length of a block.
+
+    Returns:
+        By the scatter of the residuals, and as the fit states it for independent ones.
+    """
+    steps = 1e-3 * np.diag(unit)
+    J = np.stack([(f(x + h) - f(x - h)) / (2.0 * h.sum()) for h in steps], axis=1)
+    r = f(x)
+    weight = 1.0 / np.sqrt(1.0 + (r / soft) ** 2)
+    N = J.T @ (weight[:, None] * J)
+    d = np.sqrt(np.maximum(np.diag(N), 1e-30))
+    inverse_N = np.linalg.pinv(N / np.outer(d, d), hermitian=True) / np.outer(d, d)
+    scores = (J * (weight * r)[:, None]).reshape(len(time), -1, len(x)).sum(axis=1)
+    block = ((time - time[0]) / block_s).astype(int)
+    sums = np.array([scores[block == b].sum(axis=0) for b in np.unique(block)])
+    errors, single = (inverse_N @ sums.T)[-1], (inverse_N @ scores.T)[-1]
+    common = float(errors @ errors) * len(sums) / max(len(sums) - 1, 1)
+    # never below errors that are independent from one time to the next
+    return float(np.sqrt(max(common, float(single @ single)))), float(np.sqrt(inverse_N[-1, -1]))
 
 
 def _line(q: Array) -> tuple[Array, Array]:

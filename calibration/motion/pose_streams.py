@@ -1,5 +1,6 @@
-"""Synchronises two streams of poses for hand-eye calibration: the clock offset between a robot's hand and a camera, and
-pose pairs.
+"""Synchronises two streams of poses for hand-eye calibration.
+
+The clock offset between a robot's hand and a camera, and pose pairs.
 
 Equation (eye in hand; the other mounting alike): H(t - d) X = Y E(t), with H the robot's hand in its base on the
 robot's clock, E the camera in the target's frame on its own clock, and d the camera's stamps less the robot's time of
@@ -8,13 +9,13 @@ the same instant. The offset is searched by correlating the angular speeds, whic
 """
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.poses.listing import Listing
@@ -25,6 +26,7 @@ from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
+from weldcal.calibration.motion.line_clock import offset_sigma
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
@@ -57,8 +59,10 @@ _LEAST_TURN = 0.02  # rad/s (rms): slower motion shows no offset by its speed
 
 @dataclass(frozen=True, eq=False)
 class PoseStreams:
-    """Two recorded streams: times (n,), (m,) s and poses ``hand`` X_BF (n, 4, 4) and ``eye`` X_world_eye (m, 4, 4) in
-    metres."""
+    """Two recorded streams.
+
+    Times (n,), (m,) s and poses ``hand`` X_BF (n, 4, 4) and ``eye`` X_world_eye (m, 4, 4) in metres.
+    """
 
     hand_time: Array
     hand: Array
@@ -68,9 +72,12 @@ class PoseStreams:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClockOffset:
-    """``offset_s``: time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard
-    deviation; ``X`` eye in the hand, ``Y`` world in the base, 4 x 4; ``rms_deg`` and ``rms_m`` of the frames; ``pairs``
-    for the solvers; ``before_m`` the rms at offset zero with the same poses."""
+    """The clock offset of two streams, and the poses that were estimated with it.
+
+    ``offset_s`` is the time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard
+    deviation. ``X`` is the eye in the hand, ``Y`` the world in the base, 4 x 4. ``rms_deg`` and ``rms_m`` are of the
+    frames, ``before_m`` the rms at offset zero with the same poses. ``pairs`` are for the solvers.
+    """
 
     offset_s: float
     sigma_s: float
@@ -115,13 +122,15 @@ def read_streams(path: Path) -> PoseStreams:
         table = table[np.argsort(table[:, 0], kind="stable")]
         table = table[np.concatenate([[True], np.diff(table[:, 0]) > 0.0])]
         q = table[:, 4:] / np.linalg.norm(table[:, 4:], axis=1)[:, None]
-        parts += [table[:, 0], pose(_rotations(q), table[:, 1:4])]
+        parts += [table[:, 0], pose(Rotation.from_quat(q).as_matrix(), table[:, 1:4])]
     return PoseStreams(*parts)
 
 
 def are_trajectories(robot: Listing, camera: Listing) -> bool:
-    """Whether two lists of poses with times are recordings in motion, of different lengths: they pair by
-    interpolation."""
+    """Whether two lists of poses with times are recordings in motion, of different lengths.
+
+    They pair by interpolation.
+    """
     if len(robot) == len(camera):
         return False
     for one in (robot, camera):
@@ -136,8 +145,9 @@ def are_trajectories(robot: Listing, camera: Listing) -> bool:
 def synchronise_lists(
     robot: Listing, camera: Listing, *, mounting: str = "eye_in_hand", source: str = "trajectories"
 ) -> ClockOffset:
-    """Clock offset, both poses and pairs of two trajectories, the camera's as X_CM or as the camera in the target's or
-    the world's frame.
+    """Estimate the clock offset of two trajectories, both poses, and pairs.
+
+    The camera's trajectory is X_CM, or the camera in the target's or the world's frame.
 
     Orders of quaternions and the direction of the camera's poses follow from the residuals where nobody states them.
 
@@ -266,7 +276,7 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
         unit = np.concatenate([np.repeat([scales[0], scales[1]], 3)] * 2 + [[1e-3]])
         fit = least_squares(flat, x, loss="soft_l1", f_scale=_SOFT, x_scale=unit)
         x = fit.x
-    sigma = _sigma(_jacobian(flat, x, unit), residuals(x), t)
+    sigma = offset_sigma(flat, x, unit, t, _SOFT, _BLOCK_S)[0]
     offset = start + float(x[12])
     A, B = poses_of(x)
     r = residuals(x) * np.repeat(scales, 3)
@@ -320,41 +330,3 @@ def _speed(motion: ContinuousMotion, t: Array) -> Array:
     out = np.full(len(t), np.nan)
     out[good] = np.linalg.norm(log_rotation(np.swapaxes(R0[good], 1, 2) @ R1[good]), axis=1) / (2.0 * _RATE_S)
     return out
-
-
-def _jacobian(f: Callable[[Array], Array], x: Array, unit: Array) -> Array:
-    """Central differences of f (m,) over unknowns (K,): (m, K)."""
-    steps = 1e-3 * np.diag(unit)
-    return np.stack([(f(x + h) - f(x - h)) / (2.0 * h.sum()) for h in steps], axis=1)
-
-
-def _sigma(J: Array, r: Array, t: Array) -> float:
-    """Standard deviation of the last unknown, with errors common within blocks of time.
-
-    J (6 n, K), residuals r (n, 6).
-    """
-    weight = 1.0 / np.sqrt(1.0 + (r.ravel() / _SOFT) ** 2)  # of the soft loss
-    N = J.T @ (weight[:, None] * J)
-    d = np.sqrt(np.maximum(np.diag(N), 1e-30))
-    inverse_N = np.linalg.pinv(N / np.outer(d, d), hermitian=True) / np.outer(d, d)
-    scores = (J * (weight * r.ravel())[:, None]).reshape(len(t), 6, -1).sum(axis=1)
-    block = ((t - t[0]) / _BLOCK_S).astype(int)
-    sums = np.array([scores[block == b].sum(axis=0) for b in np.unique(block)])
-    count = len(sums)
-    errors = (inverse_N @ sums.T)[-1]
-    common = float(errors @ errors) * count / max(count - 1, 1)
-    single = (inverse_N @ scores.T)[-1]
-    # never below errors that are independent from frame to frame
-    return float(np.sqrt(max(common, float(single @ single))))
-
-
-def _rotations(q: Array) -> Array:
-    x, y, z, w = q.T
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return np.asarray(R.transpose(2, 0, 1))

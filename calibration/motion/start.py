@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, nearest_rotation
 from weldcal.calibration.motion.observed import FrameClock, ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
@@ -30,7 +30,8 @@ _STEP_RAD = 1.5e-8  # of a difference: the root of the machine's precision
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Coarse result: the delay (s) of the clock's base behind capture, X_BC, and the curve of cost against delay:
+    """Coarse result: the delay (s) of the clock's base behind capture, X_BC, and the curve of cost against delay.
+
     ``delays`` (D,) s and ``rms_m`` (D,) of the better part of the frames, NaN where too few lie within the stream.
     ``X_FR``: the feature on what moves, or the fixed target X_BT.
     """
@@ -50,9 +51,11 @@ def search_start(
     *,
     delays: Array | None = None,
 ) -> Start | None:
-    """The delay, searched from EARLIEST_S to LATEST_S (or only those given, s), with the least error of a rigid fit;
+    """The delay, searched from EARLIEST_S to LATEST_S (or only those given, s), with the least error of a rigid fit.
+
     None where no delay puts enough frames within the stream. Centres and normals are used together, so that a motion
-    along a line is enough for a start."""
+    along a line is enough for a start.
+    """
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < 3:
         return None
@@ -88,8 +91,10 @@ def plausible(delays: Array, cost: Array) -> float:
 def _costs(
     frames: ObservedFrames, base: Array, delays: Array, motion: ContinuousMotion, X_FR: RigidTransform | None
 ) -> tuple[Array, Array, Array]:
-    """Mean square errors (D,) m^2 of the better frames, NaN where too few are known, rotations (D, 3, 3) and positions
-    (D, 3)."""
+    """Return the mean square errors (D,) m^2 of the better frames, rotations (D, 3, 3) and positions (D, 3).
+
+    Errors are NaN where too few frames are known.
+    """
     t = base - delays[:, None]
     X = motion.poses(t.ravel())
     if X_FR is not None:
@@ -126,7 +131,8 @@ def _rigid(p_B: Array, n_B: Array, frames: ObservedFrames, weight: Array) -> tup
 
 
 def search_in_hand(frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion) -> Start | None:
-    """The delay from EARLIEST_S to LATEST_S that fits best, with X_FC (as ``X_BC``) and the target X_BT (as ``X_FR``);
+    """The delay from EARLIEST_S to LATEST_S that fits best, with X_FC (as ``X_BC``) and the target X_BT (as ``X_FR``).
+
     ``motion`` is inverted. None where no delay puts enough frames within the stream.
 
     For a delay, R_BF (R_FC p_C + p_FC) + p_BF = p_BT and R_BF R_FC n_C = n_BT are linear in the nine elements of R_FC,
@@ -161,8 +167,10 @@ def search_in_hand(frames: ObservedFrames, clock: FrameClock, motion: Continuous
 def _at(
     frames: ObservedFrames, base: Array, delay: float, motion: ContinuousMotion
 ) -> tuple[float, Array, Array, Array, Array]:
-    """Mean square error (m^2) of the better frames at a delay (s), R_FC, p_FC, p_BT and n_BT; NaN where too few are
-    known."""
+    """Mean square error (m^2) of the better frames at a delay (s), R_FC, p_FC, p_BT and n_BT.
+
+    NaN where too few are known.
+    """
     X_FB = motion.poses(base - delay)
     known = np.isfinite(X_FB[:, 0, 0])
     nothing = (float("nan"), np.eye(3), np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -218,9 +226,7 @@ def _relaxed(R_B: Array, p_B: Array, p_C: Array, n_C: Array) -> Array:
     A[:, 3:, :9] = _ARM_M * (R_B[:, :, :, None] * n_C[:, None, None, :]).reshape(n, 3, 9)
     A[:, 3:, 15:] = -_ARM_M * np.eye(3)
     y = np.concatenate([-p_B, np.zeros((n, 3))], axis=1)
-    M = np.linalg.lstsq(A.reshape(-1, 18), y.ravel(), rcond=1e-6)[0][:9].reshape(3, 3)
-    U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return nearest_rotation(np.linalg.lstsq(A.reshape(-1, 18), y.ravel(), rcond=1e-6)[0][:9].reshape(3, 3))
 
 
 def _shifts(R_B: Array, p_B: Array, seen_F: Array) -> tuple[Array, Array]:

@@ -1,5 +1,7 @@
-"""Interpolates a robot's recorded stream in continuous time: smoothed joints or poses, velocities, and where it has no
-data."""
+"""Interpolates a robot's recorded stream in continuous time.
+
+Smoothed joints or poses, velocities, and where it has no data.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -30,8 +32,11 @@ _HELD_SHARE = 0.4  # of the samples in motion that repeat, for a stream to count
 
 @dataclass(frozen=True, eq=False)
 class FeatureMotion:
-    """Motion of the flange feature at N times, base frame: centre ``p`` (N, 3) m, outward normal ``n`` (N, 3), and
-    their rates ``v`` (N, 3) m/s and ``turn`` (N, 3) 1/s. NaN where the stream has no data."""
+    """Motion of the flange feature at N times, base frame.
+
+    Centre ``p`` (N, 3) m, outward normal ``n`` (N, 3), and their rates ``v`` (N, 3) m/s and ``turn`` (N, 3) 1/s. NaN
+    where the stream has no data.
+    """
 
     p: Array
     n: Array
@@ -130,8 +135,10 @@ def _continuous_quaternions(R: Array) -> Array:
 
 
 def _held(t: Array, values: Array) -> Flags:
-    """Samples (n,) that repeat the one before because the robot had not updated it yet; none where that is not
-    usual."""
+    """Samples (n,) that repeat the one before because the robot had not updated it yet.
+
+    None where that is not usual.
+    """
     same = np.concatenate([[False], (np.diff(values, axis=0) == 0.0).all(axis=1)])
     first = np.maximum.accumulate(np.where(same, 0, np.arange(len(t))))
     runs = np.bincount(first, minlength=len(t))  # samples of the run that begins here
@@ -144,8 +151,9 @@ def _held(t: Array, values: Array) -> Flags:
 
 
 def _smoothed(t: Array, values: Array, bounds: NDArray[np.int64]) -> tuple[Array, Array, int]:
-    """Values and slopes (n, c) of local parabolas, and their half width in samples: half of that with the least
-    leave-one-out error.
+    """Values and slopes (n, c) of local parabolas, and their half width in samples.
+
+    Half of that with the least leave-one-out error.
 
     That one balances noise and bias of a single time. Here the noise averages over the frames, while the bias where a
     move's acceleration jumps is the same in every lap; half the width has a quarter of the bias and 1.4 times the
@@ -170,8 +178,10 @@ def _smoothed(t: Array, values: Array, bounds: NDArray[np.int64]) -> tuple[Array
 
 
 def _parabolas(t: Array, values: Array, bounds: NDArray[np.int64], m: int) -> tuple[Array, Array, float]:
-    """Local parabolas over ``m`` samples on either side: values and slopes (n, c), and the mean square of the errors
-    with which each sample is predicted without itself."""
+    """Local parabolas over ``m`` samples on either side.
+
+    Values and slopes (n, c), and the mean square of the errors with which each sample is predicted without itself.
+    """
     fitted, slopes = values.copy(), np.zeros_like(values)
     total, count = 0.0, 0
     for a, b in pairwise(bounds.tolist()):

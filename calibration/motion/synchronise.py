@@ -22,10 +22,11 @@ _WORST_S = 0.01  # a less certain offset is not used
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Synchronised:
-    """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found: ``clock``
-    of the frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation, both None
-    where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames; ``source`` is
-    "recording" or "calibration".
+    """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found.
+
+    ``clock`` of the frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation,
+    both None where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames;
+    ``source`` is "recording" or "calibration".
     """
 
     clock: FrameClock
@@ -45,8 +46,9 @@ def synchronise(
     X_FR: RigidTransform | None = None,
     known: ScannerClock | None = None,
 ) -> Synchronised:
-    """Find the clock's delay in a recording itself, with the scanner near ``X_BC``; ``known`` is a calibration's clock,
-    used where the recording does not show it.
+    """Find the clock's delay in a recording itself, with the scanner near ``X_BC``.
+
+    ``known`` is a calibration's clock, used where the recording does not show it.
 
     First a search: for each delay the residuals e_k = X_BC p_C,k - p_BR(t_k), without their median, which takes out a
     scanner that stands a little elsewhere; the delay with the least median of |e|. A scanner that moves by some
@@ -124,8 +126,10 @@ def _search(
 
 
 def _spreads(seen: Array, base: Array, delays: Array, motion: ContinuousMotion, X_FR: RigidTransform | None) -> Array:
-    """Median distances (D,) m of the residuals from their median; NaN where fewer than half of the frames lie in the
-    stream."""
+    """Median distances (D,) m of the residuals from their median.
+
+    NaN where fewer than half of the frames lie in the stream.
+    """
     X = motion.poses((base - delays[:, None]).ravel())
     if X_FR is not None:
         X = X @ X_FR.GetAsMatrix4()

@@ -59,9 +59,11 @@ class PlannerConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPose:
-    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR; ``gain`` in log determinant of the information
-    of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a scanned point at the work point once this pose
-    is in."""
+    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR.
+
+    ``gain`` in log determinant of the information of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a
+    scanned point at the work point once this pose is in.
+    """
 
     X_BF: RigidTransform
     q: Array
@@ -81,8 +83,9 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the
-    work point.
+    """Plan ``n`` (>= 4) flange poses, most informative first.
+
+    Greedy D-optimal on the information of X_BC about the work point.
 
     A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.
     ``tool`` are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for
@@ -133,61 +136,56 @@ def _candidates(
     ring_R = np.vstack(
         [config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), np.zeros((1, 3))]
     )
-    span = scanner.far_m - scanner.near_m
-    near, far = scanner.near_m + config.image_margin * span, scanner.far_m - config.image_margin * span
     for _ in range(config.max_trials):
         if len(pool) >= config.candidates:
             break
-        X_CR = _random_feature(rng, scanner, near, far, config)
+        X_CR = random_view(rng, scanner, config.feature_radius_m, config.image_margin, config.theta_max_rad)
         if X_CR is None:
             why["the flange does not fit into the scanner's field of view"] += 1
             continue
         X_BR = X_BC @ X_CR
         X_BF = X_BR @ X_RF
-        if (
-            float(np.linalg.norm(X_BF.translation())) > reach
-            or float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
-        ):
-            low = float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
-            why["the table is in the way" if low else "the scanner's working range is out of the arm's reach"] += 1
-            continue
-        q = nearest_solution(arm, X_BF, q_start)
-        if q is None:
-            why["the scanner's working range is out of the arm's reach"] += 1
-            continue
-        reason = _refuse(arm, q, X_BC, X_BR, ring_R, bodies, q_start, config)
-        if reason is not None:
+        q, reason = None, "the scanner's working range is out of the arm's reach"
+        if float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m:
+            reason = "the table is in the way"
+        elif float(np.linalg.norm(X_BF.translation())) <= reach:
+            q = nearest_solution(arm, X_BF, q_start)
+        if q is not None:
+            reason = _refuse(arm, q, X_BC, X_BR, ring_R, bodies, q_start, config)
+        if q is None or reason:
             why[reason] += 1
-            continue
-        pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
+        else:
+            pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
     return pool, why
 
 
-def _random_feature(
-    rng: np.random.Generator, scanner: ScannerPreset, near: float, far: float, config: PlannerConfig
+def random_view(
+    rng: np.random.Generator, scanner: ScannerPreset, radius_m: float, image_margin: float, theta_max_rad: float
 ) -> RigidTransform | None:
-    z = rng.uniform(near, far)
-    radius = config.feature_radius_m
-    limits = []
+    """Draw a pose X_CR of a circle that lies whole in the scanner's image and working range, less a margin of both.
+
+    The normal lies within ``theta_max_rad`` of the line of sight, uniform over that cap. None where the circle does not
+    fit into the image at the distance drawn.
+    """
+    span = image_margin * (scanner.far_m - scanner.near_m)
+    z = rng.uniform(scanner.near_m + span, scanner.far_m - span)
+    place = []
     for f, c, size in ((scanner.fx, scanner.cx, scanner.width), (scanner.fy, scanner.cy, scanner.height)):
-        free = config.image_margin * size
-        low, high = (free - c) / f * z + radius, (size - 1 - free - c) / f * z - radius
+        free = image_margin * size
+        low, high = (free - c) / f * z + radius_m, (size - 1 - free - c) / f * z - radius_m
         if low >= high:
             return None
-        limits.append(rng.uniform(low, high))
-    p = np.array([*limits, z])
+        place.append(rng.uniform(low, high))
+    p = np.array([*place, z])
     sight = -p / np.linalg.norm(p)
-    # uniform over the cap of directions within theta_max of the line of sight
-    tilt = float(np.arccos(rng.uniform(np.cos(config.theta_max_rad), 1.0)))
+    tilt = float(np.arccos(rng.uniform(np.cos(theta_max_rad), 1.0)))
     side = np.cross(sight, [1.0, 0.0, 0.0])
     side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
     normal = exp_rotation(tilt * side) @ sight
     x = np.cross([0.0, 1.0, 0.0], normal)
     x /= np.linalg.norm(x)
-    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal])) @ RotationMatrix.MakeZRotation(
-        rng.uniform(-np.pi, np.pi)
-    )
-    return RigidTransform(R, p)
+    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
+    return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
 
 
 def _refuse(
@@ -199,8 +197,8 @@ def _refuse(
     bodies: list[LinkCapsule],
     q_start: Array,
     config: PlannerConfig,
-) -> str | None:
-    """Why this posture will not do, or None."""
+) -> str:
+    """Why this posture will not do, or an empty text."""
     if float(np.abs(q - q_start).max()) > config.max_travel_rad:
         return "the joints would have to travel too far from the start posture"
     if sigma_min(jacobian(arm, q)) < config.min_sigma:
@@ -220,7 +218,7 @@ def _refuse(
     if hidden:
         return "the arm hides the flange from the scanner"
     between = config.surroundings.blocks(eye, ring_B)
-    return f"{between} hides the flange from the scanner" if between else None
+    return f"{between} hides the flange from the scanner" if between else ""
 
 
 def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:
@@ -246,8 +244,10 @@ def _sigma_at_work(information: Array) -> float:
 
 
 def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: PlannerConfig) -> list[PlannedPose]:
-    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each
-    other."""
+    """Choose the ``n`` poses that in turn add most to the log determinant of the information.
+
+    They keep apart from each other.
+    """
     if not pool:
         return []
     work = _work_point(config, X_BC, [c.X_BR for c in pool])

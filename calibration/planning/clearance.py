@@ -56,8 +56,10 @@ def lowest_point(bodies: list[LinkCapsule], frames: list[RigidTransform], up: Ar
 
 
 def self_distance(bodies: list[LinkCapsule], frames: list[RigidTransform]) -> float:
-    """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are
-    sampled."""
+    """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing).
+
+    Segments are sampled.
+    """
     ends = np.array([body_ends(b, frames) for b in bodies])
     links, radii = np.array([b.link for b in bodies]), np.array([float(b.radius) for b in bodies])
     return float(_smallest_gap(ends, links, radii, _SAMPLES))
@@ -65,8 +67,10 @@ def self_distance(bodies: list[LinkCapsule], frames: list[RigidTransform]) -> fl
 
 @compiled()
 def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: Array) -> float:
-    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes
-    are sampled."""
+    """Smallest gap between bodies at least three links apart.
+
+    ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes are sampled.
+    """
     n, m = len(ends), len(samples)
     points = np.empty((n, m, 3))
     for i in range(n):
@@ -92,8 +96,9 @@ def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: 
 def path_clearance(
     arm: ArmModel, bodies: list[LinkCapsule], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
-    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between
-    bodies on a path straight in joint space.
+    """Return the lowest height (m) of the moving bodies and the smallest gap (m) on a path straight in joint space.
+
+    Heights are over B's origin, along the arm's ``up``; gaps are between bodies.
 
     ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
     """
@@ -105,8 +110,9 @@ def path_clearance(
 def occludes(
     bodies: list[LinkCapsule], frames: list[RigidTransform], eye: Array, targets: Array, margin_m: float = 0.0
 ) -> tuple[bool, float]:
-    """Whether a body hides any of the targets (N, 3) from the eye (3,), and the smallest gap (m) from a body to the
-    eye.
+    """Test whether a body hides any of the targets (N, 3) from the eye (3,).
+
+    Also returns the smallest gap (m) from a body to the eye.
 
     The place of the eye is known to `margin_m` only: no line of sight from anywhere so near may be blocked.
     A body that holds or touches a target carries it and does not hide it: the face looks away from its own body.

@@ -1,5 +1,4 @@
-"""Estimates the poses of a mounting together with the scanner's correction, from circles that were seen at known joint
-angles."""
+"""Estimate the poses of a mounting and the scanner's correction from circles seen at known joint angles."""
 
 from __future__ import annotations
 
@@ -14,18 +13,11 @@ from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.flange.base_circle import fit_base_circle
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.geometry.robust import radius_95
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.se3 import as_transform, skew
 from weldcal.calibration.hand_eye.determinacy import check_poses, determinacy, with_open_directions
 from weldcal.calibration.hand_eye.mountings import TargetObservation
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, inverse_information, linearise
-from weldcal.calibration.hand_eye.solve import (
-    HandEyeConfig,
-    HandEyeHeldOut,
-    HandEyeResult,
-    as_transform,
-    fold_labels,
-    solve_problem,
-)
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeHeldOut, HandEyeResult, fold_labels, solve_problem
 from weldcal.calibration.planning.mounting_poses import MountingPose, work_point
 from weldcal.calibration.planning.mounting_scene import LENGTH_M, MountingScene
 from weldcal.models.arrays import Array
@@ -49,8 +41,11 @@ _FACTORS = ("scale", "gradient along x", "gradient along y", "bend in x", "twist
 
 @dataclass(frozen=True)
 class Circle:
-    """The circle to look for: its dimensions, how far it may lie from its prediction (m), and whether it is the ring of
-    the base mounting, whose far side is hidden by its column."""
+    """The circle to look for.
+
+    Its dimensions, how far it may lie from its prediction (m), and whether it is the ring of the base mounting, whose
+    far side is hidden by its column.
+    """
 
     standard: FlangeStandard
     guess_radius_m: float
@@ -59,8 +54,10 @@ class Circle:
 
 @dataclass(frozen=True, eq=False)
 class ObservedCircle:
-    """One scan with the circle: the arms' joints and expected view, the observation, and the visible share of the
-    circle's edge."""
+    """One scan with the circle.
+
+    The arms' joints and expected view, the observation, and the visible share of the circle's edge.
+    """
 
     label: str
     pose: MountingPose
@@ -83,8 +80,10 @@ class MountingResult(HandEyeResult):
     arm_error_m: float
 
     def point_covariance(self, p_C: Array) -> Array:
-        """Covariance (3, 3) m^2 of a scanned point, in the frame that carries the scanner; ``p_C`` (3,) m, as
-        scanned."""
+        """Covariance (3, 3) m^2 of a scanned point, in the frame that carries the scanner.
+
+        ``p_C`` (3,) m, as scanned.
+        """
         return np.asarray(self.slopes(p_C) @ self.with_factors @ self.slopes(p_C).T)
 
     def place(self, p_C: Array) -> Array:
@@ -236,9 +235,10 @@ def _state(result: HandEyeResult, given: State) -> State:
 
 @dataclass(eq=False, kw_only=True)
 class _Data:
-    """Observations (n) of a circle: problem, centres and normals as measured, their stated covariance (n, 5, 5),
-    derivatives (n, 5, k) by errors of links and covariance (n, 5, 5) of stops (both follow from the state), usual
-    factors, and field of the correction.
+    """Observations (n) of a circle.
+
+    Problem, centres and normals as measured, their stated covariance (n, 5, 5), derivatives (n, 5, k) by errors of
+    links and covariance (n, 5, 5) of stops (both follow from the state), usual factors, and field of the correction.
     """
 
     problem: Problem
@@ -356,8 +356,10 @@ def _corrected(problem: Problem, p: Array, normal: Array) -> Problem:
 
 
 def _links(scene: MountingScene, poses: Sequence[MountingPose], state: State) -> tuple[Array, Array]:
-    """Derivatives (n, 5, links) by errors of the links between circle and scanner, each in units of its expected size,
-    and the covariance (n, 5, 5) that the arm's repeatability gives."""
+    """Return derivatives (n, 5, links) by errors of the links between circle and scanner.
+
+    Each is in units of its expected size. Also returns the covariance (n, 5, 5) that the arm's repeatability gives.
+    """
     belief = scene.believing(
         {name: as_transform(X) for name, X in zip(NAMES, state, strict=True) if name not in scene.known}
     )
@@ -379,8 +381,10 @@ def _links(scene: MountingScene, poses: Sequence[MountingPose], state: State) ->
 
 
 def expected_error(scene: MountingScene, result: MountingResult) -> tuple[float, float]:
-    """Expected error (m) of a scanned point at the scanner's best distance: rms, and the bound that it keeps with 95
-    %."""
+    """Expected error (m) of a scanned point at the scanner's best distance.
+
+    Rms, and the bound that it keeps with 95 %.
+    """
     S = result.point_covariance(work_point(scene))
     return float(np.sqrt(np.trace(S))), radius_95(S)
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.problem import linearise
+from weldcal.calibration.planning.calibration_poses import random_view
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import jacobian, sigma_min
@@ -47,7 +47,9 @@ class MountingPlan:
 @dataclass(frozen=True, eq=False)
 class MountingPose:
     """A pose to visit: joints (6,) rad of the first and, where there is one, the second arm; X_CR that is expected.
-    ``via_home``: the straight way from the pose before it is not free, the one through home is."""
+
+    ``via_home``: the straight way from the pose before it is not free, the one through home is.
+    """
 
     q: Array
     q_2: Array | None
@@ -56,9 +58,11 @@ class MountingPose:
 
 
 def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
-    """Plan ``n`` poses, most informative first (greedy, D-optimal in the unknowns), then ``held_out`` drawn at random,
-    then all others that would do. Each of the first n + held_out has a free way from home, the second arm going first,
-    and is reached on it or from the pose before (the first held-out one from home). Deterministic for ``plan.seed``.
+    """Plan ``n`` poses, most informative first, then ``held_out`` drawn at random, then all others that would do.
+
+    The order is greedy and D-optimal in the unknowns. Each of the first n + held_out has a free way from home, the
+    second arm going first, and is reached on it or from the pose before (the first held-out one from home).
+    Deterministic for ``plan.seed``.
 
     Raises:
         UnreachableScanner: one sentence that names the commonest obstacle.
@@ -81,9 +85,11 @@ def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: Mount
 
 
 def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
-    """Information of observations of the circle at some poses (k, m + 3, m + 3): of the free unknowns, in the order of
-    the solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,)
-    along the circle's own axes."""
+    """Information of observations of the circle at some poses (k, m + 3, m + 3).
+
+    Of the free unknowns, in the order of the solver, and of a constant bias of the centre in its own frame.
+    ``sigma_m``: of the centre, one for all or (3,) along the circle's own axes.
+    """
     observations = [
         scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses
     ]
@@ -113,8 +119,10 @@ def _at(pose: MountingPose) -> tuple[Array, Array | None]:
 def _way(
     bodies: Bodies, start: tuple[Array, Array | None], end: tuple[Array, Array | None], plan: MountingPlan
 ) -> bool:
-    """Whether one arm after the other, the second first, gets from start to end, and back home in the opposite
-    order."""
+    """Test whether one arm after the other, the second first, gets from start to end.
+
+    The way back home has the opposite order.
+    """
     between = (start[0], end[1])
     if bodies.scene.two and not bodies.clear(start, between, plan.table_z_m, plan.step_rad):
         return False
@@ -122,8 +130,10 @@ def _way(
 
 
 def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
-    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one
-    before it where that is free too."""
+    """Return the first n poses with a free way from home.
+
+    The way home is the same backwards. Each pose is reached from the one before it where that is free too.
+    """
     home = (bodies.scene.q_home, bodies.scene.q_home_2)
     kept: list[MountingPose] = []
     for pose in poses:
@@ -159,7 +169,7 @@ def _pool(
 
 def _by_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
     """Draw how the scanner sees the circle, and ask for the joints."""
-    X_CR = _random_view(scene, plan, rng)
+    X_CR = random_view(rng, scene.scanner, scene.radius_m, plan.image_margin, plan.theta_max_rad)
     if X_CR is None:
         return "the circle does not fit into the scanner's field of view"
     q_2 = None
@@ -188,29 +198,6 @@ def _by_joints(scene: MountingScene, plan: MountingPlan, rng: np.random.Generato
     if not ((q >= scene.arm.position_lower) & (q <= scene.arm.position_upper)).all():
         return "a joint is at its limit"
     return q, None
-
-
-def _random_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> RigidTransform | None:
-    s, r = scene.scanner, scene.radius_m
-    span = plan.image_margin * (s.far_m - s.near_m)
-    z = rng.uniform(s.near_m + span, s.far_m - span)
-    place = []
-    for f, c, size in ((s.fx, s.cx, s.width), (s.fy, s.cy, s.height)):
-        free = plan.image_margin * size
-        low, high = (free - c) / f * z + r, (size - 1 - free - c) / f * z - r
-        if low >= high:
-            return None
-        place.append(rng.uniform(low, high))
-    p = np.array([*place, z])
-    sight = -p / np.linalg.norm(p)
-    tilt = float(np.arccos(rng.uniform(np.cos(plan.theta_max_rad), 1.0)))
-    side = np.cross(sight, [1.0, 0.0, 0.0])
-    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
-    normal = exp_rotation(tilt * side) @ sight
-    x = np.cross([0.0, 1.0, 0.0], normal)
-    x /= np.linalg.norm(x)
-    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
-    return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
 
 
 def _refuse(scene: MountingScene, bodies: Bodies, plan: MountingPlan, q: Array, q_2: Array | None) -> str | None:

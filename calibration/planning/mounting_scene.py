@@ -37,8 +37,10 @@ _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class CarriedLink:
-    """A link between base and scanner (``sign`` +1) or circle (-1): frames in B of the link before it and of itself;
-    its errors' size, and its joint's spread at a stop, rad."""
+    """A link between base and scanner (``sign`` +1) or circle (-1): frames in B of the link before it and of itself.
+
+    Its errors' size, and its joint's spread at a stop, rad.
+    """
 
     X_before: RigidTransform
     X: RigidTransform
@@ -75,8 +77,10 @@ class MountingScene:
 
     @cached_property
     def sizes(self) -> tuple[tuple[float, float], ...]:
-        """Of each arm: error (rad) of each angle of a link, for which the flange at home is off by ``arm_error_m``
-        (rms), and spread (rad) of each joint at a stop, by which it moves by ``repeatability_m``."""
+        """Return, of each arm, the error (rad) of each angle of a link, and the spread (rad) of each joint at a stop.
+
+        Such errors put the flange at home off by ``arm_error_m`` (rms), such spreads move it by ``repeatability_m``.
+        """
         found = []
         for arm, q in ((self.arm, self.q_home), (self.arm_2, self.q_home_2)):
             if arm is not None and q is not None:
@@ -168,8 +172,10 @@ class MountingScene:
 
 
 class Bodies:
-    """Bodies that may collide or occlude: arms, the scanner where an arm carries it; each capsule is nine points with a
-    radius."""
+    """Bodies that may collide or occlude: arms, the scanner where an arm carries it.
+
+    Each capsule is nine points with a radius.
+    """
 
     def __init__(self, scene: MountingScene) -> None:
         self.scene = scene
@@ -228,8 +234,10 @@ class Bodies:
     def clear(
         self, starts: tuple[Array, Array | None], ends: tuple[Array, Array | None], table_z_m: float, step_rad: float
     ) -> bool:
-        """Whether a move straight in the joints of both arms (one of them may rest) keeps off the table and of what may
-        touch."""
+        """Test whether a move straight in the joints keeps off the table and of what may touch.
+
+        Both arms move, or one of them rests.
+        """
         (a, a_2), (b, b_2) = starts, ends
         far = float(np.abs(b - a).max())
         if a_2 is not None and b_2 is not None:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, skew
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse, log_rotation, skew
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, State, linearise
-from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -56,8 +56,11 @@ def tilt(G: Array) -> Array:
 
 
 def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None = None) -> VisibleVolume:
-    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what
-    was ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
+    """Return what a scanner preset sees, else a camera matrix ``K``, else what was ``seen`` (n, 4, 4) so far.
+
+    The picture of a camera matrix is centred on its principal point, and its distances are those seen. What was seen is
+    taken a little wider.
+    """
     steep = max(_STEEPEST_RAD, float(np.quantile(tilt(seen), 0.9)))
     if scanner is not None:
         wide = [min(c, size - 1 - c) / f for c, size, f in _axes(scanner)]
@@ -96,12 +99,13 @@ _MOST = 0.8  # of the poses so far that a robot must reach, to be the one that t
 
 @dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles
-    ``q`` (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the
-    predicted sigma (3-D) at the work point before and after, and what was ``checked``."""
+    """A pose to add, and the predicted sigma (3-D) at the work point before and after.
+
+    ``X_BF`` is the first robot's pose, or None where the mounting leaves it open; ``q`` (rad) its joint angles where a
+    robot was named. The target is turned from a taken sample, ``like``; ``checked`` says what was.
+    """
 
     X_BF: RigidTransform | None
-    X_CM: RigidTransform
     like: int
     turn_deg: float
     axis_C: Array
@@ -140,8 +144,9 @@ def next_pose(
     arm: Chain | None = None,
     view: VisibleVolume | None = None,
 ) -> NextPose | None:
-    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there
-    or elsewhere.
+    """Choose the most informative of poses like the samples.
+
+    The target is turned by 20, 40 or 60 degrees, and seen there or elsewhere.
 
     Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for
     it within its limits; where none is named, or where it does not even reach the poses so far (another base or tool
@@ -193,7 +198,6 @@ def next_pose(
     k, q = found
     return NextPose(
         X_BF=None if robot is None else as_transform(robot[k]),
-        X_CM=as_transform(G[k]),
         like=int(taken[like[k]]),
         turn_deg=float(np.degrees(angle[k])),
         axis_C=axis[k],

@@ -58,8 +58,9 @@ def check_diversity(
 
 
 def hidden_bias_sigma(poses: list[RigidTransform], sigma_position_m: float) -> Array:
-    """Standard deviation (3,) m, along x, y, z of the feature frame R, with which the poses would show a constant bias
-    of the centre.
+    """Predict the standard deviation (3,) m with which the poses would show a constant bias of the centre.
+
+    It is along x, y, z of the feature frame R.
 
     The bias b (in R) and the camera pose are estimated together: p_B + R_BR b = X_BC p_C; infinite where no pose
     differs in orientation, because the bias then is a mere shift of the camera.

@@ -20,8 +20,10 @@ ARM_ERRORS = len(OFFSET_JOINTS) + len(SAG_JOINTS) + 6 * len(TABLE)
 
 @dataclass(frozen=True, eq=False)
 class ProfilerArmErrors:
-    """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3): a m, alpha
-    rad, d m."""
+    """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3).
+
+    a m, alpha rad, d m.
+    """
 
     offsets: Floats
     sag: Floats
@@ -47,8 +49,10 @@ class ProfilerArmErrors:
 
 @dataclass(frozen=True, eq=False)
 class DhArm:
-    """A six-axis arm by standard Denavit-Hartenberg rows (6, 4): a m, alpha rad, d m, theta offset rad; base z
-    upwards."""
+    """A six-axis arm by standard Denavit-Hartenberg rows (6, 4): a m, alpha rad, d m, theta offset rad.
+
+    Base z upwards.
+    """
 
     rows: Floats
 
@@ -96,8 +100,10 @@ class DhArm:
         return out
 
     def loads(self, q: Floats) -> Floats:
-        """Horizontal lever (n, 2) m of the flange about the axes of joints 2 and 3: what gravity turns them by, but for
-        a factor."""
+        """Horizontal lever (n, 2) m of the flange about the axes of joints 2 and 3.
+
+        What gravity turns them by, but for a factor.
+        """
         frames = self.frames(q)
         flange = frames[:, 6, :2, 3]
         radial = flange / np.maximum(np.linalg.norm(flange, axis=1, keepdims=True), 1e-9)
@@ -119,8 +125,9 @@ class DhArm:
         return self.changed(errors.table).poses(q, errors.offsets, errors.sag, loads)
 
     def twists(self, q: Floats, errors: ProfilerArmErrors, loads: Floats) -> tuple[Floats, Floats]:
-        """How the flange moves with each error: turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in
-        B.
+        """How the flange moves with each error.
+
+        Turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in B.
 
         An offset turns all beyond it about the joint's axis, d shifts it along that axis; a shifts along, and alpha
         turns about, the x axis of the frame after the joint.

@@ -1,5 +1,7 @@
-"""Read profiles from the exports of laser profilers: tables, blocks, grids of heights, LMI Gocator sections and OpenCV
-documents."""
+"""Read profiles from the exports of laser profilers.
+
+Tables, blocks, grids of heights, LMI Gocator sections and OpenCV documents.
+"""
 
 import re
 from collections.abc import Mapping
@@ -229,8 +231,10 @@ def _numbered(scan: Floats) -> np.ndarray[Any, Any]:
 
 
 def _runs(poses: Floats) -> np.ndarray[Any, Any]:
-    """The number of each row's profile where no column tells it: rows that follow each other with one pose, else each
-    row."""
+    """The number of each row's profile where no column tells it.
+
+    Rows that follow each other with one pose, else each row.
+    """
     new = np.concatenate([[True], (np.abs(np.diff(poses, axis=0)) > 0.0).any(axis=1)])
     if np.count_nonzero(new) * _REPEATED <= len(poses):
         return np.asarray(np.cumsum(new) - 1)
@@ -238,8 +242,10 @@ def _runs(poses: Floats) -> np.ndarray[Any, Any]:
 
 
 def _captions(blocks: list[NumberRows]) -> tuple[str, ...]:
-    """Names of profiles by the captions of their blocks, such as "Profile 3"; empty where they have no numbers of their
-    own."""
+    """Names of profiles by the captions of their blocks, such as "Profile 3".
+
+    Empty where they have no numbers of their own.
+    """
     numbers = [number_of(b.caption) for b in blocks]
     if None in numbers or len(set(numbers)) < len(numbers):
         return ()
@@ -254,8 +260,10 @@ def _without_empty(points: Floats) -> Floats:
 
 
 def _empty(z: Floats) -> np.ndarray[Any, Any]:
-    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its
-    neighbours in raw integers."""
+    """Heights that mean that nothing was measured.
+
+    -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its neighbours in raw integers.
+    """
     marks = np.zeros(z.shape, bool)
     for power in (2, 3, 4, 5):
         mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3) | ((power > 3) & (z == -(10.0**power)))

@@ -1,5 +1,7 @@
-"""Import profiles with flange poses: a table, an export with poses in a file beside it, or a folder with one file per
-profile."""
+"""Import profiles with flange poses.
+
+a table, an export with poses in a file beside it, or a folder with one file per profile.
+"""
 
 import re
 from collections.abc import Sequence
@@ -96,8 +98,10 @@ def import_profiles(
 
 
 def _poses_only(path: Path) -> Listing | None:
-    """The poses of a file without profiles; None where it holds none, or numbers without names, which may be
-    heights."""
+    """The poses of a file without profiles.
+
+    None where it holds none, or numbers without names, which may be heights.
+    """
     try:
         if path.suffix.lower() in TABLES and any(not b.header for b in blocks_of(read_text(path), path.name)):
             return None

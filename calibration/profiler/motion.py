@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.se3 import angle_of, exp_rotation, skew
 from weldcal.models.errors import InputError
 
 Floats = NDArray[np.float64]
 
 ORTHONORMAL = 1e-6  # a choice: six printed digits of a matrix leave half of it
+KEPT = 3  # different optima that are polished
+SAME_RAD = 0.02  # a choice: nearer ends of descents are one optimum; half only polishes the same one twice
 SAME_ROTATION_RAD = 1e-4  # orientations of a group differ by less: a robot holds one to a hundredth of this
 
 
@@ -77,15 +79,16 @@ def rotation_groups(poses: FlangePoses) -> NDArray[np.intp]:
     for k in range(len(R)):
         if group[k] >= 0:
             continue
-        cosine = 0.5 * (np.einsum("nij,ij->n", R, R[k]) - 1.0)
-        group[(np.arccos(np.clip(cosine, -1.0, 1.0)) < SAME_ROTATION_RAD) & (group < 0)] = found
+        group[(angle_of(R[k].T @ R) < SAME_ROTATION_RAD) & (group < 0)] = found
         found += 1
     return group
 
 
 def rotation_axes_spread(rotation: Floats) -> float:
-    """Second singular value over the first of the axes of all turns from the first orientation: 0 where all share one
-    axis."""
+    """Second singular value over the first of the axes of all turns from the first orientation.
+
+    0 where all share one axis.
+    """
     turns = np.array([_axis_times_sine(rotation[0].T @ R) for R in rotation[1:]])
     if len(turns) < 2:
         return 0.0
@@ -99,13 +102,16 @@ def _axis_times_sine(R: Floats) -> Floats:
 
 def turned(R: Floats, w: Floats) -> Floats:
     """R exp(w) for stacks of rotations (..., 3, 3) and rotation vectors (..., 3) in their own frame."""
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    K = skew(w)
-    small = angle < 1e-8
-    safe = np.where(small, 1.0, angle)
-    s = np.where(small, 1.0, np.sin(safe) / safe)
-    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    return np.asarray(R @ (np.eye(3) + s * K + c * (K @ K)))
+    return np.asarray(R @ exp_rotation(w))
+
+
+def distinct(R: Floats, order: NDArray[np.intp]) -> list[int]:
+    """The first few of rotations (m, 3, 3), taken in that order, that differ from each other."""
+    chosen: list[int] = []
+    for k in order:
+        if len(chosen) < KEPT and all(angle_of(R[k].T @ R[j]) > SAME_RAD for j in chosen):
+            chosen.append(int(k))
+    return chosen
 
 
 def times_own(rows: Floats, M: Floats) -> Floats:

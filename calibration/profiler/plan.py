@@ -40,8 +40,10 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class PosePlan:
-    """Indices of the candidates in the order of taking them, and the rms uncertainty (1 + len) m before and after
-    each."""
+    """Indices of the candidates in the order of taking them, and the uncertainty with each.
+
+    ``rms_m`` (1 + len) m is that before and after each.
+    """
 
     chosen: tuple[int, ...]
     rms_m: Floats
@@ -166,8 +168,10 @@ def _rms(H: Floats, maps: Floats, unit: Floats) -> float:
 def sample_edge_poses(
     state: EdgeState, count: int, seed: int, field: Field | None = None, tilt_deg: float = 35.0
 ) -> FlangePoses:
-    """Flange poses from which the edge crosses the field of view, tilted and turned at random about looking down on
-    it."""
+    """Draw flange poses from which the edge crosses the field of view.
+
+    They are tilted and turned at random about looking down on it.
+    """
     f, rng = field or Field(), np.random.default_rng(seed)
     down = np.array([0.0, 0.0, -1.0])
     x = np.cross(state.direction, down)

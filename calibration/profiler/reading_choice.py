@@ -1,5 +1,7 @@
-"""Decide how the flange poses of profiles are to be read: the target of the calibration must be one sphere or one
-edge."""
+"""Decide how the flange poses of profiles are to be read.
+
+The target of the calibration must be one sphere or one edge.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +11,7 @@ import numpy as np
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.geometry.se3 import angle_of, exp_rotation
 from weldcal.calibration.profiler.edge.joint import edge_optima
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
@@ -29,8 +31,10 @@ _SAME_M, _SAME_RAD = 0.1e-3, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ReadingFit:
-    """What a reading of the poses leaves: squared residual (n,) m^2 of each scan, numbers that each scan contributes,
-    unknowns, R_FS and p_FS."""
+    """What a reading of the poses leaves.
+
+    Squared residual (n,) m^2 of each scan, numbers that each scan contributes, unknowns, R_FS and p_FS.
+    """
 
     square: Floats
     each: int
@@ -124,8 +128,7 @@ def _mm(fit: ReadingFit) -> str:
 
 
 def _same(one: ReadingFit, other: ReadingFit) -> bool:
-    cosine = 0.5 * (float(np.trace(one.rotation.T @ other.rotation)) - 1.0)
-    turn = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    turn = float(angle_of(one.rotation.T @ other.rotation))
     return turn < _SAME_RAD and float(np.linalg.norm(one.translation - other.translation)) < _SAME_M
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.results import matrix4, software_version
+from weldcal.calibration.data.results import pose_document, pose_of_document, software_version
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
@@ -95,12 +95,7 @@ class ProfilerRecord:
 def save_record(record: ProfilerRecord, folder: Path) -> tuple[Path, Path]:
     """Write profiler.yaml and X_FS.json into a folder; their paths."""
     X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(record.rotation), record.translation)
-    q = X.rotation().ToQuaternion()
-    pose = {
-        "matrix": matrix4(X),
-        "xyz": [float(v) for v in record.translation],
-        "wxyz": [float(v) for v in (q.w(), q.x(), q.y(), q.z())],
-    }
+    pose = pose_document(X)
     covariance = None
     if record.covariance is not None:
         covariance = {
@@ -147,9 +142,8 @@ def load_record(path: Path) -> ProfilerRecord:
     if not isinstance(document, dict) or document.get("schema") != 1 or "X_FS" not in document:
         raise InputError(f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again.")
     d = DocumentSection.of(path.name, document)
-    M = d.section("X_FS").array("matrix", 4, 4)
-    if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
-        raise InputError(f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again.")
+    refusal = f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again."
+    X_FS = pose_of_document(d.section("X_FS"), refusal)
     sensor, table = d.section("sensor"), d.section("arm")
     arm, offsets, sag = None, np.zeros(len(OFFSET_JOINTS)), np.zeros(len(SAG_JOINTS))
     if d.has("arm"):
@@ -157,8 +151,8 @@ def load_record(path: Path) -> ProfilerRecord:
         offsets, sag = table.array("offsets", len(offsets)), table.array("sag", len(sag))
     return ProfilerRecord(
         method=d.text("method"),
-        rotation=M[:3, :3],
-        translation=M[:3, 3],
+        rotation=X_FS.rotation().matrix(),
+        translation=np.asarray(X_FS.translation()),
         covariance=d.section("covariance").array("matrix", 6, 6) if d.has("covariance") else None,
         affine=sensor.array("x_scale_z_scale_shear", 3),
         origin=sensor.array("origin", 2),

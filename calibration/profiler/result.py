@@ -1,5 +1,6 @@
 """The result of a profiler calibration: X_FS, its covariance and residuals, and its least certain direction."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +8,12 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import DegenerateMotion
+from weldcal.calibration.geometry.se3 import angle_of
 from weldcal.calibration.profiler.motion import Floats
 
 VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration
+APART_RAD = np.radians(1.0)  # a choice: optima nearer than this are one
+OPEN_RAD = np.radians(5.0)  # a choice: a rotation that is uncertain by more is no calibration
 LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange
 
 
@@ -45,8 +49,10 @@ class ProfilerEstimate:
 
 
 def worst_direction(normal_matrix: Floats) -> str:
-    """Description of the direction that a motion determines least: the part of [rotation; translation] (6, 6, in F)
-    with the least information."""
+    """Description of the direction that a motion determines least: the part of [rotation.
+
+    Translation] (6, 6, in F) with the least information.
+    """
     unit = np.diag([1.0 / LEVER_M] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(unit @ normal_matrix @ unit)
     v = vectors[:, int(np.argmin(values))]
@@ -56,9 +62,36 @@ def worst_direction(normal_matrix: Floats) -> str:
     return f"{kind} ({part[0]:.2f}, {part[1]:.2f}, {part[2]:.2f}) of the flange"
 
 
+def refuse_open(covariance: Floats, best: Floats, rivals: Sequence[Floats], what: str, advice: str) -> None:
+    """Refuse what a covariance (6, 6), which is local, does not show: another mounting as good, or hardly a rotation.
+
+    Args:
+        covariance: of the estimate; best: its R_FS (3, 3).
+        rivals: rotations of other optima that explain the data as well.
+        what: points or scans, for the message; advice: what to do besides tilting the flange.
+
+    Raises:
+        DegenerateMotion: a rival lies apart from the best, or the rotation is uncertain by five degrees.
+    """
+    sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
+    for other in rivals:
+        angle = float(angle_of(best.T @ other))
+        if angle > max(APART_RAD, 5.0 * sigma):
+            raise DegenerateMotion(
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these {what} alike: tilt"
+                f" the flange more, about two axes, and {advice}"
+            )
+    if sigma > OPEN_RAD:
+        raise DegenerateMotion(
+            f"These {what} leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
+            f" further, about two axes, and {advice}"
+        )
+
+
 def believed_covariance(estimate: ProfilerEstimate) -> Floats:
-    """Covariance (6, 6) of an estimate, scaled by the larger reduced chi-square where the residuals exceed the stated
-    sigmas.
+    """Scale the covariance (6, 6) of an estimate where the residuals exceed the stated sigmas.
+
+    The factor is the larger reduced chi-square.
 
     Raises:
         DegenerateMotion: a direction is so open that this is no calibration, though the motion is not quite degenerate.

@@ -153,8 +153,10 @@ def blocks_of(text: str, name: str) -> list[NumberRows]:
 
 @dataclass(frozen=True, eq=False)
 class GocatorProfiles:
-    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured; names of the columns
-    before the points."""
+    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured.
+
+    Names of the columns before the points.
+    """
 
     section: str
     points: tuple[Floats, ...]

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -50,15 +51,20 @@ def surface_normals(points_R: Array, standard: FlangeStandard) -> Array:
 
 
 def information(points_R: Array, normals_R: Array) -> Array:
-    """Information matrix (6, 6), order [rotation; translation], about the origin of R, of points (n, 3) m that each
-    measure their distance along their normal (n, 3), in units of one measurement (1 for each point)."""
+    """Information matrix (6, 6), order [rotation.
+
+    Translation], about the origin of R, of points (n, 3) m that each measure their distance along their normal (n, 3),
+    in units of one measurement (1 for each point).
+    """
     J = np.hstack([np.cross(points_R, normals_R), normals_R])
     return np.asarray(J.T @ J)
 
 
 def sigmas(matrix: Array, noise_m: float) -> Array:
-    """Standard deviation (6,), rad and m, of each component, the others unknown as well; infinite where
-    unobservable."""
+    """Standard deviation (6,), rad and m, of each component, the others unknown as well.
+
+    Infinite where unobservable.
+    """
     values, vectors = np.linalg.eigh(_scaled(matrix))
     variance = np.where(values > 1e-9 * max(float(values[-1]), 1e-30), 1.0 / np.maximum(values, 1e-30), np.inf)
     share = vectors**2
@@ -134,8 +140,10 @@ class VerificationError:
 
     @property
     def components(self) -> tuple[tuple[str, float, bool], ...]:
-        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre; NaN
-        where it could not."""
+        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre.
+
+        NaN where it could not.
+        """
         seen = [n not in self.unobservable for n in COMPONENTS]
         return tuple(
             (n, float(v) if s else float("nan"), s) for n, v, s in zip(COMPONENTS, self.value, seen, strict=True)
@@ -234,20 +242,9 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     revolution but for its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees
     less than that: `sight` measures how much.
     """
-    import open3d as o3d  # slow to import
-
-    X_RC = verification.X_BR.inverse() @ X_BC
-    source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((X_RC @ verification.points_C.T).T))
-    target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(verification.model_R))
-    target.normals = o3d.utility.Vector3dVector(verification.model_normals_R)
-    registration = o3d.pipelines.registration
-    plane_like = verification.method == "point_to_plane"
-    estimation = (
-        registration.TransformationEstimationPointToPlane()
-        if plane_like
-        else registration.TransformationEstimationPointToPoint()
-    )
-    result = registration.registration_icp(source, target, verification.max_distance_m, np.eye(4), estimation)
+    X_RC, model = verification.X_BR.inverse() @ X_BC, verification.model_R
+    placed = (X_RC @ verification.points_C.T).T
+    result = registered(placed, model, verification.model_normals_R, verification.max_distance_m, verification.method)
     if result.fitness < _MIN_FITNESS or not np.isfinite(result.transformation).all():
         return FAILED
     E_R = _without_last_digits(np.asarray(result.transformation))
@@ -258,7 +255,7 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     normals = verification.model_normals_R[pairs[:, 1]] if standard is None else surface_normals(matched, standard)
     matrix = information(matched, normals)
     off = ((matched - verification.model_R[pairs[:, 1]]) * verification.model_normals_R[pairs[:, 1]]).sum(axis=1)
-    noise = 1.4826 * float(np.median(np.abs(off)))
+    noise = MAD * float(np.median(np.abs(off)))
     unobservable = unobservable_components(matrix)
     seen = E_R.inverse()
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
@@ -268,9 +265,23 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     return VerificationError(value, correction, float(result.fitness), rmse, unobservable, sigmas(matrix, noise))
 
 
+def registered(points: Array, model: Array, normals: Array, reach: float, method: Method) -> Any:
+    """Open3D's ICP result of points (n, 3) on a model (m, 3) with normals (m, 3), partners at most ``reach`` apart."""
+    import open3d as o3d  # slow to import
+
+    source, target = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points, model))
+    target.normals = o3d.utility.Vector3dVector(normals)
+    ways = o3d.pipelines.registration
+    to_plane, to_point = ways.TransformationEstimationPointToPlane, ways.TransformationEstimationPointToPoint
+    estimation = to_plane() if method == "point_to_plane" else to_point()
+    return ways.registration_icp(source, target, reach, np.eye(4), estimation)
+
+
 def _without_last_digits(X: Array) -> RigidTransform:
-    """A pose (4, 4) to 1e-10 m and rad: Open3D's threads add up in any order, so that the last digits are others in
-    each run."""
+    """A pose (4, 4) to 1e-10 m and rad.
+
+    Open3D's threads add up in any order, so that the last digits are others in each run.
+    """
     R, p = np.round(X[:3, :3], 10), np.round(X[:3, 3], 10)
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
@@ -313,14 +324,11 @@ def translation_cost(error: Array) -> float:
     return float(np.linalg.norm(error[3:]))
 
 
-def work_radius_cost(work_radius_m: float) -> Cost:
-    """Section 4.2: norm of (dx, dy, dz, r droll, r dpitch, r dyaw), r the work radius, m."""
-    return axes_cost((0, 1, 2, 3, 4, 5), work_radius_m)
-
-
 def translation_and_rotation_cost(work_radius_m: float) -> Cost:
-    """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m: a bound on the
-    error there, where the paper's work_radius_cost is a norm of all six."""
+    """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m.
+
+    a bound on the error there, where the paper's is a norm of all six.
+    """
 
     def cost(error: Array) -> float:
         return float(np.linalg.norm(error[3:]) + work_radius_m * np.linalg.norm(error[:3]))
@@ -348,9 +356,11 @@ COSTS = ("translation", "translation_and_rotation", "work_radius")
 
 
 def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
-    """The cost a scenario asks for: the translation; section 4.2's norm over the chosen ``axes`` of COST_AXES at the
-    work radius (``work_radius``); or a bound on the error at that radius (``translation_and_rotation``). Raises
-    InputError."""
+    """The cost a scenario asks for: the translation.
+
+    Section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius (``work_radius``); or a bound on the
+    error at that radius (``translation_and_rotation``). Raises InputError.
+    """
     if name not in COSTS:
         raise InputError(f"calibration.cost must be {', '.join(COSTS[:-1])} or {COSTS[-1]}, not '{name}'.")
     if not work_radius_m >= 0.0:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -10,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import fit_rigid, rotation_vector
-from weldcal.calibration.published.algorithm1 import FAILED, VerificationError
+from weldcal.calibration.published.algorithm1 import FAILED, Method, VerificationError, registered
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
@@ -39,8 +38,10 @@ class CircleParameters:
 
 @dataclass(frozen=True)
 class PublishedCircle:
-    """Centre (3,) m in C, radius m, points within e_d of it, and how many of the k_max triples passed the model
-    check."""
+    """The circle of a face by the paper's search.
+
+    Centre (3,) m in C, radius m, points within e_d of it, and how many of the k_max triples passed the model check.
+    """
 
     center_C: Array
     radius: float
@@ -87,8 +88,10 @@ def search_circle(points_C: Array, parameters: CircleParameters | None = None, *
 
 
 def circumcircles(triples: Array) -> tuple[Array, Array]:
-    """Centres (k, 3) and radii (k,) of the circles through point triples (k, 3, 3); radius NaN where the points are
-    collinear or repeated."""
+    """Centres (k, 3) and radii (k,) of the circles through point triples (k, 3, 3).
+
+    Radius NaN where the points are collinear or repeated.
+    """
     A, u, v = triples[:, 0], triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
     w = np.cross(u, v)
     uu, vv, ww = ((x * x).sum(axis=1) for x in (u, v, w))
@@ -97,9 +100,6 @@ def circumcircles(triples: Array) -> tuple[Array, Array]:
     to_center = (np.cross(w, u) * vv[:, None] + np.cross(v, w) * uu[:, None]) / (2.0 * ww[:, None])
     radii = np.where(flat, np.nan, np.linalg.norm(to_center, axis=1))
     return A + to_center, radii
-
-
-Method = Literal["point_to_point", "point_to_plane"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +122,10 @@ class PublishedParameters:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PublishedVerification:
-    """Eq. (13): measured verification face (n, 3) m in C, the robot's X_BF there, and a CAD without chamfers: points
-    (m, 3) m and normals (m, 3) in F. Called with X_BC it gives e_icp as the paper takes it, at the camera's origin in
-    the camera's axes.
+    """Eq. (13): measured verification face (n, 3) m in C, the robot's X_BF there, and a CAD without chamfers.
+
+    Points (m, 3) m and normals (m, 3) in F. Called with X_BC it gives e_icp as the paper takes it, at the camera's
+    origin in the camera's axes.
     """
 
     points_C: Array
@@ -141,9 +142,12 @@ class PublishedVerification:
 
 
 def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0) -> tuple[Array, Array]:
-    """The ground-true cloud of Fig. 6 in F: points (m, 3) m of a CAD model with sharp edges, sampled evenly over the
-    face and the first 2 mm of its walls, and normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors'
-    program (which makes them lean at every edge)."""
+    """The ground-true cloud of Fig. 6 in F.
+
+    Points (m, 3) m of a CAD model with sharp edges, sampled evenly over the face and the first 2 mm of its walls, and
+    normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors' program (which makes them lean at every
+    edge).
+    """
     import open3d as o3d  # slow to import
 
     mesh = flange_mesh(standard, chamfers=False)
@@ -155,29 +159,24 @@ def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0)
 
 
 def published_icp(X_BC: RigidTransform, verification: PublishedVerification) -> VerificationError:
-    """Eq. (13): register the measured face to the CAD face that ``X_BC`` puts into the camera frame; e_icp = Cam'_Cam
-    H.
+    """Eq. (13): register the measured face to the CAD face that ``X_BC`` puts into the camera frame.
+
+    E_icp = Cam'_Cam H.
 
     ``value`` is (roll, pitch, yaw; x, y, z) of e_icp, rad and m, at the camera's origin: a turn about a flange 0.4 m
     away enters the translation with that lever. Its failings are kept: partners within 1 mm only, no chamfer on the
     CAD, a stop rule that depends on the unit. One is not, for the paper itself says so: without a match the error is
     infinite, where the registration returns the identity.
     """
-    import open3d as o3d  # slow to import
-
     X_CF = X_BC.InvertAndCompose(verification.X_BF)
     unit = verification.unit_m
-    source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(verification.points_C / unit))
-    target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((X_CF @ verification.model_F.T).T / unit))
-    registration = o3d.pipelines.registration
-    target.normals = o3d.utility.Vector3dVector(verification.normals_F @ X_CF.rotation().matrix().T)
-    estimation = (
-        registration.TransformationEstimationPointToPlane()
-        if verification.method == "point_to_plane"
-        else registration.TransformationEstimationPointToPoint()
+    result = registered(
+        verification.points_C / unit,
+        (X_CF @ verification.model_F.T).T / unit,
+        verification.normals_F @ X_CF.rotation().matrix().T,
+        verification.max_distance_m / unit,
+        verification.method,
     )
-    reach = verification.max_distance_m / unit
-    result = registration.registration_icp(source, target, reach, np.eye(4), estimation)
     T = np.array(result.transformation)
     if result.fitness == 0.0 or not np.isfinite(T).all():
         return FAILED
@@ -212,8 +211,10 @@ def find_centres(
 
 
 def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, RigidTransform]) -> list[Observation]:
-    """Eq. (9): TCP of the controller and centre of the circle, scan by scan; the circle's centre is taken for the
-    TCP."""
+    """Eq. (9): TCP of the controller and centre of the circle, scan by scan.
+
+    The circle's centre is taken for the TCP.
+    """
     return [Observation(id, poses[id], circle.center_C) for id, circle in circles.items()]
 
 
@@ -223,8 +224,11 @@ def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
 
 
 def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:
-    """The paper's e_icp (camera origin) as (6,) rotation vector (rad) and displacement of the flange centre (m), both
-    in axes of F: the same transform without the lever of the working distance. Infinite where the ICP failed."""
+    """Return the paper's e_icp as (6,) rotation vector (rad) and displacement of the flange centre (m), in axes of F.
+
+    It is the same transform as at the camera's origin, without the lever of the working distance. Infinite where the
+    ICP failed.
+    """
     if error.X_CpC is None:
         return np.full(6, np.inf)
     X_FC = X_BF.InvertAndCompose(X_BC)

@@ -1,5 +1,7 @@
-"""The error budget of a calibration: what each source contributes to the error at the work point, and what to reduce
-next."""
+"""The error budget of a calibration.
+
+What each source contributes to the error at the work point, and what to reduce next.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,11 @@ _IT8 = 25.0  # tolerance units of grade 8 (ISO 286-1), which ISO 9409-1 asks of 
 
 @dataclass(frozen=True)
 class Contribution:
-    """One source: root mean square distance ``mm`` that it adds at the work point, what that rests on (measured, data
-    sheet or assumed), and what would reduce it, with the ``left`` share of it that then remains."""
+    """One source of error, with what would reduce it.
+
+    It adds the root mean square distance ``mm`` at the work point, and rests on a measurement, a data sheet or an
+    assumption. ``left`` is the share of it that then remains.
+    """
 
     source: str
     mm: float
@@ -36,8 +41,10 @@ class Contribution:
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Contributions at ``p_B_mm`` in the base, independent of each other; ``held_out_mm`` is the root mean square of
-    the held-out errors, None where there are too few."""
+    """Contributions at ``p_B_mm`` in the base, independent of each other.
+
+    ``held_out_mm`` is the root mean square of the held-out errors, None where there are too few.
+    """
 
     p_B_mm: tuple[float, float, float]
     rows: tuple[Contribution, ...]
@@ -173,8 +180,10 @@ _REFINE = "Use --refine joints with joint angles and turned poses, or --refine l
 
 
 def _estimated(estimate: CalibrationEstimate, p_B: Array) -> tuple[float, float]:
-    """Squared errors (m^2) of a point at p_B (3,) m from the pose with the scanner's factors known, and what not
-    knowing them adds."""
+    """Return squared errors (m^2) of a point at p_B (3,) m from the pose with the scanner's factors known.
+
+    The second part is what not knowing them adds.
+    """
     whole = float(np.trace(point_error_covariance(estimate, p_B)))
     if estimate.joint is None or estimate.scanner is None:
         return whole, 0.0
@@ -186,7 +195,9 @@ def _estimated(estimate: CalibrationEstimate, p_B: Array) -> tuple[float, float]
 
 
 def _tolerance(diameter_m: float) -> float:
-    """Width (m) of the tolerance of grade 8 at a diameter (ISO 286-1: 25 i, i = 0.45 D^(1/3) + 0.001 D in um, D in
-    mm)."""
+    """Width (m) of the tolerance of grade 8 at a diameter.
+
+    ISO 286-1: 25 i, i = 0.45 D^(1/3) + 0.001 D in um, D in mm.
+    """
     D = 1e3 * diameter_m
     return float(1e-6 * _IT8 * (0.45 * D ** (1.0 / 3.0) + 1e-3 * D))

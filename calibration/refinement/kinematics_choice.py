@@ -82,8 +82,10 @@ def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: 
 
 
 def arm_document(fit: KinematicsFit) -> dict[str, Any]:
-    """The errors as plain types for calibration.yaml (rad, m), with the covariance of X_BC, scanner factors and errors
-    / prior."""
+    """Return the errors as plain types for calibration.yaml (rad, m).
+
+    The covariance is that of X_BC, scanner factors and errors / prior.
+    """
     found = fit.errors
     return {
         "names": list(found.names),
@@ -102,8 +104,9 @@ def shared_error(
     observations: Sequence[Observation],
     q: Array,
 ) -> tuple[Array, Array] | None:
-    """Derivatives (n, 3, p) of positions of new scans by what the result estimated, and its covariance (p, p); None
-    where it states none.
+    """Derivatives (n, 3, p) of positions of new scans by what the result estimated, and its covariance (p, p).
+
+    None where it states none.
 
     ``observations`` (n) as seen, with the poses that the arm of ``kinematics`` reaches at q (n, joints).
 
@@ -143,9 +146,11 @@ def shared_error(
 
 @dataclass(frozen=True, eq=False)
 class KinematicsChoice:
-    """A fit and the errors of poses (n,) that neither it nor the plain calibration saw: ``plain_m`` and ``refined_m``,
-    ``tilt_rad`` with the fit, NaN where the others fix none. ``accepted``: the fit is applied; ``sentence``: why, and
-    what it found."""
+    """A fit and the errors of poses (n,) that neither it nor the plain calibration saw.
+
+    ``plain_m`` and ``refined_m``, ``tilt_rad`` with the fit, NaN where the others fix none. ``accepted``: the fit is
+    applied; ``sentence``: why, and what it found.
+    """
 
     fit: KinematicsFit
     plain_m: Array
@@ -166,8 +171,9 @@ def choose_kinematics(
     correct_scanner: bool = True,
     seed: int = 0,
 ) -> KinematicsChoice:
-    """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and
-    decide on them.
+    """Fit errors of the arm to n inlier observations at joint angles q (n, joints), and decide on them.
+
+    The fit starts from the observations' plain estimate.
 
     In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if
     the mean falls by 5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The
@@ -286,8 +292,10 @@ def with_kinematics(
 
 
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
-    """The arm's link transforms with the errors found, as a file of Universal Robots' schema (m, rad; load_arm reads
-    it)."""
+    """The arm's link transforms with the errors found, as a file of Universal Robots' schema.
+
+    m, rad; load_arm reads it.
+    """
     links = {}
     for link, moved in zip(LINKS, fit.corrected_stack(), strict=True):
         rpy = RollPitchYaw(RotationMatrix.ProjectToRotationMatrix(moved[:3, :3])).vector()

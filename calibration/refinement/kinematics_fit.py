@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, pose, skew
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, flange_poses, inverse, pose, skew
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
 
@@ -35,8 +35,10 @@ _POSE_SIGMA, _FACTOR_SIGMA = (
 
 @dataclass(frozen=True)
 class FactoryPrior:
-    """Standard deviations of what a maker's arm is off: zero of a joint, turn of its axis (rad), place of its axis
-    (m)."""
+    """Standard deviations of what a maker's arm is off.
+
+    Zero of a joint, turn of its axis (rad), place of its axis (m).
+    """
 
     offset_rad: float = float(np.radians(0.035))
     turn_rad: float = float(np.radians(0.02))
@@ -49,8 +51,10 @@ class FactoryPrior:
 
 @dataclass(frozen=True, eq=False)
 class ArmErrors:
-    """Errors of an arm that are sought: ``which`` (k,) of its 6 n numbers, their ``scale`` (k,) (prior, rad or m) and
-    ``names``."""
+    """Errors of an arm that are sought.
+
+    ``which`` (k,) of its 6 n numbers, their ``scale`` (k,) (prior, rad or m) and ``names``.
+    """
 
     arm: Chain
     which: NDArray[np.int64]
@@ -82,8 +86,9 @@ def unsought(arm: Chain, kind: str) -> ArmErrors | None:
 
 
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
-    """Joint offsets (``kind`` "joints") or all errors of the links ("links") that a scanner beside the arm can tell
-    from its own pose.
+    """Return the errors of the arm that a scanner beside it can tell from its own pose.
+
+    ``kind`` is "joints" for joint offsets, or "links" for all errors of the links.
 
     All of the first joint moves the base as a whole, and the turn of the last one about its axis does not show on a
     flange: both are left out.
@@ -98,10 +103,12 @@ def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmE
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KinematicsFit:
-    """Camera pose, correction and errors u (k,) in units of their prior; ``covariance`` (6 + K + k,) of all: rotation
-    on the base side about the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis,
-    ``redundancy`` the spare numbers of positions. ``sigma_considered`` (k,): standard deviations of u where other
-    errors of the arm were considered."""
+    """Camera pose, correction and errors u (k,) in units of their prior.
+
+    ``covariance`` (6 + K + k,) of all: rotation on the base side about the camera's origin, its displacement, factors,
+    u. The sigmas are the scatter per axis, ``redundancy`` the spare numbers of positions. ``sigma_considered`` (k,):
+    standard deviations of u where other errors of the arm were considered.
+    """
 
     X_BC: RigidTransform
     correction: ScannerCorrection
@@ -139,25 +146,24 @@ class KinematicsFit:
         poses = self.errors.moved(q, data.after, self.u)
         c, m = _corrected(self.correction, data)
         return [
-            replace(
-                o,
-                X_BR=RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]),
-                p_CR=p,
-                n_C=None if o.n_C is None else n,
-            )
+            replace(o, X_BR=as_transform(X), p_CR=p, n_C=None if o.n_C is None else n)
             for o, X, p, n in zip(observations, poses, c, m, strict=True)
         ]
 
     def sensitivity(self, observations: Sequence[Observation], q: Array) -> Array:
-        """Derivatives (n, 6, 6 + K + k) of each scan's position (m) and normal (rad) by everything that is
-        estimated."""
+        """Return the derivatives (n, 6, 6 + K + k) of each scan by everything that is estimated.
+
+        A scan is its position (m) and normal (rad).
+        """
         n = len(observations)
         J = _jacobian(self, _arrays(observations, self.errors, q), q)
         return np.concatenate([J[: 3 * n].reshape(n, 3, -1), J[3 * n :].reshape(n, 3, -1)], axis=1)
 
     def predicted(self, observations: Sequence[Observation], q: Array) -> Array:
-        """Covariance (n, 3, 3) m^2 of the position error at new poses: of everything estimated, and of the scan
-        itself."""
+        """Covariance (n, 3, 3) m^2 of the position error at new poses.
+
+        Of everything estimated, and of the scan itself.
+        """
         data = _arrays(observations, self.errors, q)
         J = self.sensitivity(observations, q)[:, :3]
         R = self.X_BC.rotation().matrix()
@@ -185,8 +191,9 @@ def fit_kinematics(
     fixed_scanner: bool = False,
     considered: ArmErrors | None = None,
 ) -> KinematicsFit:
-    """Fit everything to observations (n) at joint angles q (n, joints), from a plain calibration; ``holes`` is what the
-    hole circles say of the scanner. ``fixed_scanner`` holds the correction.
+    """Fit everything to observations (n) at joint angles q (n, joints), from a plain calibration.
+
+    ``holes`` is what the hole circles say of the scanner. ``fixed_scanner`` holds the correction.
 
     Gauss-Newton with derivatives by differences; maximum a posteriori (arm: ``errors``' prior; scanner: what scanners
     usually are off). The scatters of positions and normals follow from the residuals (Helmert). ``considered``: errors
@@ -297,8 +304,10 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
 
 
 def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
-    """Positions (3 n) m, then what the seen normals lie beside those of the reached poses X (n, 4, 4) (3 n) rad, in the
-    base."""
+    """Return position residuals (3 n) m, then those of the seen normals (3 n) rad, in the base.
+
+    The latter lie beside the normals of the reached poses X (n, 4, 4).
+    """
     return _beside(*_seen(f, data), data, X)
 
 
@@ -352,8 +361,9 @@ def _jacobian(f: KinematicsFit, data: _Data, q: Array) -> Array:
 
 
 def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: str = "links") -> NDArray[np.int64]:
-    """Indices (n,) of those joint angles q (m, joints) rad, of flange poses that the scanner sees, to scan for
-    `--refine`.
+    """Choose indices (n,) of joint angles q (m, joints) rad to scan for `--refine`.
+
+    The scanner sees the flange at their poses.
 
     Greedy: each next pose lowers the expected squared position error over all m poses most (V-optimal design, Atkinson,
     Donev and Tobias 2007, 10.6). The first ones say most.
@@ -373,9 +383,7 @@ def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: 
         errors=sought,
     )
     scans = [
-        Observation(
-            str(i), RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]), c[:3, 3], c[:3, 2]
-        )
+        Observation(str(i), as_transform(X), c[:3, 3], c[:3, 2])
         for i, (X, c) in enumerate(zip(stated, seen, strict=True))
     ]
     J = fit.sensitivity(scans, q)

@@ -1,5 +1,7 @@
-"""A field of what a calibration leaves at the flange: Gaussian process over the place and orientation of the robot's
-poses."""
+"""A field of what a calibration leaves at the flange.
+
+Gaussian process over the place and orientation of the robot's poses.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,9 @@ _STARTS_M = (0.08, 0.2, 0.5)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalField:
-    """Residuals (n, 3) m, in the base, at poses of the flange (``places`` (n, 3) m and ``turns`` (n, 3, 3)), and what
-    lies between.
+    """A field of residuals at poses of the flange, and what lies between.
+
+    Residuals (n, 3) m are in the base, at ``places`` (n, 3) m and ``turns`` (n, 3, 3).
 
     The covariance of the field at two poses is ``sigma_field_m``^2 exp(-d^2 / 2 ``length_m``^2 - a^2 / 2
     ``turn_rad``^2) for each axis, d their distance and a the angle between them; every scan has ``sigma_scan_m`` (per
@@ -58,8 +61,10 @@ class LocalField:
     sigma_scan_m: float
 
     def at(self, X_BR: Sequence[RigidTransform]) -> tuple[Array, Array]:
-        """The field (m, 3) m at poses, and the standard deviation (m,) m per axis of what it and the scan itself
-        leave."""
+        """Return the field (m, 3) m at poses, and the standard deviation (m,) m per axis of what is left.
+
+        It and the scan itself leave that.
+        """
         places, turns = _poses(X_BR)
         k = _kernel(places, turns, self.places, self.turns, self._values)
         known = np.einsum("ij,jk,ik->i", k, self._inverse, k)
@@ -72,8 +77,10 @@ class LocalField:
         return np.asarray(k @ (self._inverse @ self.residuals))
 
     def applied(self, X_BC: RigidTransform, observations: Sequence[Observation]) -> list[Observation]:
-        """Observations whose centres (camera frame) are moved by the field, so that X_BC maps them to where it expects
-        them."""
+        """Move the centres of observations by the field, so that X_BC maps them to where it expects them.
+
+        They are in the camera frame.
+        """
         if not observations:
             return []
         shift, _ = self.at([o.X_BR for o in observations])
@@ -129,8 +136,9 @@ def field_from_document(document: dict[str, Any] | None, file: str = "") -> Loca
 
 
 def fit_field(X_BR: Sequence[RigidTransform], residuals: Array) -> LocalField:
-    """The field through residuals (n, 3) m at n poses; lengths and spreads maximise the marginal likelihood times a
-    prior.
+    """The field through residuals (n, 3) m at n poses.
+
+    Lengths and spreads maximise the marginal likelihood times a prior.
 
     The prior is wide (a factor of 2 to 3) about what cells show: 0.2 m, 10 degrees, 0.15 mm of field and 0.1 mm of
     single scans. Where the orientation does not vary, the 10 degrees are the prior's.
@@ -191,9 +199,12 @@ _STARTS = 60
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalChoice:
-    """A field and the errors of poses (n,) that neither it nor the calibration saw: ``plain_m``, ``tilt_rad`` and
-    ``local_m`` with it, NaN where the others fix none; ``squares`` (n,): the squared error with the field in units of
-    its stated variance (3 on average). ``accepted``: the field is applied; ``sentence``: why."""
+    """A field and the errors of poses (n,) that neither it nor the calibration saw.
+
+    ``plain_m``, ``tilt_rad`` and ``local_m`` with it, NaN where the others fix none; ``squares`` (n,): the squared
+    error with the field in units of its stated variance (3 on average). ``accepted``: the field is applied;
+    ``sentence``: why.
+    """
 
     field: LocalField
     plain_m: Array
@@ -213,8 +224,9 @@ def choose_local(
     correct_scanner: bool = True,
     seed: int = 0,
 ) -> LocalChoice:
-    """Fit a field to the held-out residuals of a calibration (``X_BC`` with ``correction``) of n inlier observations,
-    and decide on it.
+    """Fit a field to the held-out residuals of a calibration of n inlier observations, and decide on it.
+
+    The calibration is ``X_BC`` with ``correction``.
 
     For every held-out pose (20 folds at most) the whole is repeated without it: the choice of the scanner's correction,
     the held-out residuals of the others, the field and its lengths. The field is accepted if the mean of these errors
@@ -287,8 +299,10 @@ def held_out_residuals(
 def with_field(
     estimate: CalibrationEstimate, choice: LocalChoice, corrected: Sequence[Observation]
 ) -> tuple[CalibrationEstimate, list[Observation]]:
-    """The estimate with the nested held-out errors of the choice, and the observations with the field where it was
-    accepted."""
+    """Apply the choice to the estimate's held-out errors and, where it was accepted, to the observations.
+
+    The held-out errors are nested.
+    """
     position, tilt = estimate.held_out.position_m.copy(), estimate.held_out.tilt_rad.copy()
     position[estimate.inliers] = choice.local_m if choice.accepted else choice.plain_m
     tilt[estimate.inliers] = choice.tilt_rad

@@ -26,8 +26,9 @@ _GRID_ERROR = 0.08  # of the spacing: how far a landmark may lie from the grid's
 
 
 def find_landmarks(image: Grey, columns: int, rows: int, look: Look = "rings") -> Array:
-    """Image positions (rows * columns, 2) px of the page's landmarks, row by row from its first; centre of the first
-    pixel at (0, 0).
+    """Image positions (rows * columns, 2) px of the page's landmarks, row by row from its first.
+
+    Centre of the first pixel at (0, 0).
 
     ``image`` (h, w) or (h, w, 3), 8 bits. Rings: landmark 0 is the full disc, so the page may be turned in the image.
     Dots are all alike: the page must stand upright in the image within 45 degrees. Centres are centroids of darkness;
@@ -40,15 +41,19 @@ def find_landmarks(image: Grey, columns: int, rows: int, look: Look = "rings") -
 
 
 def find_marks(image: Grey, most: int, look: Look = "rings") -> tuple[Array, Array | None]:
-    """Centres (k, 2) px of what looks like a landmark, of dots the `most` strongest and a few to spare; and how full
-    the rings are (k,), None for dots."""
+    """Centres (k, 2) px of what looks like a landmark, of dots the `most` strongest and a few to spare.
+
+    And how full the rings are (k,), None for dots.
+    """
     grey: Grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, dtype=np.uint8)
     return _rings(grey) if look == "rings" else (_dots(grey, most + _SPARE), None)
 
 
 def arrange(points: Array, full: Array | None, columns: int, rows: int) -> Array:
-    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2); see
-    find_landmarks."""
+    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2).
+
+    See find_landmarks.
+    """
     n = columns * rows
     mark = "dot" if full is None else "ring"
     if len(points) < n:

@@ -36,8 +36,10 @@ _LEAST_READINGS = (
 
 @dataclass(frozen=True)
 class Queries:
-    """Points of the tablet that were seen but not used: pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches
-    them."""
+    """Points of the tablet that were seen but not used.
+
+    Pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches them.
+    """
 
     uv_px: Array
     theta_rad: Array
@@ -46,8 +48,10 @@ class Queries:
 
 @dataclass(frozen=True)
 class PlanarVisit:
-    """One visit: its touches, its queries where it has any, the rows of its landmarks in the file, and the rows
-    excluded."""
+    """One visit with its touches, and its queries where it has any.
+
+    Besides: the rows of its landmarks in the file, and the rows excluded.
+    """
 
     name: str
     touches: TabletTouches
@@ -65,9 +69,11 @@ class PlanarFile:
 
 
 def load_planar(path: Path) -> PlanarFile:
-    """Visits from an npz: uv (n, 2) px, depth (n) mm, hand (n, 2) mm, theta_deg (n), delta_px (n, 2), tablet_px (n, 2),
-    mm_per_px, f (px; one number or two), c (2) px, hand_capture (3) mm; optionally uv_q (q, 2), theta_q (q) rad, hand_q
-    (q, 2) mm. Where uv is (m, n, 2) there are m visits, and every other key may have that dimension in front, too.
+    """Visits from an npz.
+
+    Uv (n, 2) px, depth (n) mm, hand (n, 2) mm, theta_deg (n), delta_px (n, 2), tablet_px (n, 2), mm_per_px, f (px; one
+    number or two), c (2) px, hand_capture (3) mm; optionally uv_q (q, 2), theta_q (q) rad, hand_q (q, 2) mm. Where uv
+    is (m, n, 2) there are m visits, and every other key may have that dimension in front, too.
 
     A landmark with a value that is not a number is excluded; a depth that is missing (or the key) is the tablet's plane
     by PnP. Raises TabletDataError: unreadable, a key missing, a shape that does not fit; and what refuses a visit where
@@ -96,8 +102,10 @@ def load_planar(path: Path) -> PlanarFile:
 
 
 def hand_step_m(visits: tuple[PlanarVisit, ...]) -> float:
-    """The step (m) to which hands were rounded when they were read off: 5, 2, 1 or 0.5 mm, or 0 where they are
-    finer."""
+    """The step (m) to which hands were rounded when they were read off.
+
+    5, 2, 1 or 0.5 mm, or 0 where they are finer.
+    """
     mm = 1e3 * np.concatenate([v.touches.hand_m.ravel() for v in visits])
     if mm.size < _LEAST_READINGS:
         return 0.0

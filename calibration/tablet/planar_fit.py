@@ -48,11 +48,6 @@ class LinearFit:
     scale: float
     condition: float
 
-    @property
-    def pen_m(self) -> Array:
-        """Pen tip from the hand's axis (2,) m, in the hand's frame."""
-        return self.parameters[4:]
-
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return np.asarray((_design(rays.T, theta_rad) @ self.parameters).T)
@@ -132,8 +127,10 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
 
 
 def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArray[np.int64]) -> Array:
-    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together; NaN where the rest determines
-    nothing."""
+    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together.
+
+    NaN where the rest determines nothing.
+    """
     errors = np.full((rays.shape[1], 2), np.nan)
     for k in range(number.max() + 1):
         keep, one = number != k, number == k
@@ -164,11 +161,6 @@ class PlanarFit:
     sigma_m: float
     free_scale: tuple[float, float]
 
-    @property
-    def pen_m(self) -> Array:
-        """Pen tip from the hand's axis (2,) m, in the hand's frame."""
-        return self.parameters[3:5]
-
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return hand_over(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
@@ -176,8 +168,11 @@ class PlanarFit:
 
 @dataclass(frozen=True)
 class PlanarConfig:
-    """``sign`` of the touching error; ``free_scale`` where the tablet's pixel pitch is not to be trusted; ``step_m`` to
-    which the hand's position was rounded when it was read off (0: not), and ``noise_m`` per axis of a touch besides."""
+    """``sign`` of the touching error; ``free_scale`` where the tablet's pixel pitch is not to be trusted.
+
+    ``step_m`` to which the hand's position was rounded when it was read off (0: not), and ``noise_m`` per axis of a
+    touch besides.
+    """
 
     sign: Sign = Sign.CORRECTED
     free_scale: bool = False

@@ -173,8 +173,10 @@ def stage2_residuals(touches: TabletTouches, affine: Array, stage1: Landmarks, s
 
 
 def apply_affine(a: Array, points: Array, about: Array | None = None) -> Array:
-    """Eq. 24 on points (k, n, 2) mm for a (k, 5) = X, Y, Sx, Sy (1), theta (deg), about a point (k, 2) or landmark
-    4."""
+    """Apply Eq. 24 to points (k, n, 2) mm, about a point (k, 2) or landmark 4.
+
+    a (k, 5) is X, Y, Sx, Sy (1), theta (deg).
+    """
     X, Y, Sx, Sy, theta = np.asarray(a).T[:, :, None]
     centre = points[:, CENTRE : CENTRE + 1] if about is None else np.asarray(about)[:, None, :]
     d = points - centre
@@ -193,8 +195,10 @@ def fitness(residuals: Array) -> Fitness:
 
 @dataclass(frozen=True)
 class DistanceMinimum:
-    """Where the sum of the two mean distances is smallest: ``parameters`` (p,), ``residuals`` (2 n, 2) mm, how often
-    the residuals of one parameter set were computed."""
+    """Where the sum of the two mean distances is smallest.
+
+    ``parameters`` (p,), ``residuals`` (2 n, 2) mm, how often the residuals of one parameter set were computed.
+    """
 
     parameters: Array
     residuals: Array
@@ -321,8 +325,9 @@ def hand_to_touch(
     theta_rad: Array,
     model: Model = "htm",
 ) -> Array:
-    """Hand positions (m, 2) m from which the pen touches what is seen at ``uv_px`` (m, 2), by Eq. 8, or Eq. 25 with an
-    affine pair (10,).
+    """Return hand positions (m, 2) m from which the pen touches what is seen at ``uv_px`` (m, 2).
+
+    By Eq. 8, or by Eq. 25 with an affine pair (10,).
 
     ``fitted``: the touches that the parameters come from; A_n turns about their landmark 4.
     """

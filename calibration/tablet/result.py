@@ -5,11 +5,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydrake.common.yaml import yaml_dump
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose, export_urdf, matrix4, software_version
+from weldcal.calibration.data.results import (
+    export_ros2,
+    export_ur_pose,
+    export_urdf,
+    pose_document,
+    pose_of_document,
+    software_version,
+)
 from weldcal.models.documents import DocumentSection, as_number, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER
@@ -17,7 +23,7 @@ from weldcal.models.result_files import require_whole, write_atomic
 
 RESULT_FILE = "tablet.yaml"
 _CONFIGURATION = "eye_in_hand_tablet"
-PARENT, CHILD = "flange", "camera_optical_frame"
+PARENT, CHILD = "tool0", "camera_optical_frame"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +60,7 @@ class TabletResult:
             "model": self.model,
             "parameters": dict(self.parameters),
             "covariance": self.covariance,
-            "X_FC": None if self.X_FC is None else _pose(self.X_FC),
+            "X_FC": None if self.X_FC is None else pose_document(self.X_FC),
             "X_FC_covariance": self.X_FC_covariance,
             "p_FP_m": self.p_FP_m,
             "p_FP_covariance": self.p_FP_covariance,
@@ -66,11 +72,6 @@ class TabletResult:
             "warnings": list(self.warnings),
             "data_sha256": dict(self.data_sha256),
         }
-
-
-def _pose(X: RigidTransform) -> dict[str, Any]:
-    q = X.rotation().ToQuaternion().wxyz()
-    return {"matrix": matrix4(X), "xyz": [float(v) for v in X.translation()], "wxyz": [float(v) for v in q]}
 
 
 def save_tablet_result(result: TabletResult, folder: Path) -> tuple[Path, ...]:
@@ -100,10 +101,8 @@ def load_tablet_result(path: Path) -> TabletResult:
     d = DocumentSection.of(path.name, document)
     X_FC = None
     if d.has("X_FC"):
-        M = d.section("X_FC").array("matrix", 4, 4)
-        if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
-            raise InputError(f"The rotation of X_FC in '{path.name}' is not orthonormal; the file was changed by hand.")
-        X_FC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3])
+        refusal = f"The rotation of X_FC in '{path.name}' is not orthonormal; the file was changed by hand."
+        X_FC = pose_of_document(d.section("X_FC"), refusal)
     n = len(d.items("covariance"))
     left_out = d.items("leave_one_out_mm")
     if not all(v is None or abs(as_number(v)) <= LARGEST_NUMBER for v in left_out):

@@ -1,5 +1,7 @@
-"""What errors of the arm, unknown but as large as makers leave them, do to touches after a calibration that was made
-with the same arm."""
+"""Predict what unknown errors of the arm do to touches after a calibration with the same arm.
+
+The errors are as large as makers leave them.
+"""
 
 from __future__ import annotations
 
@@ -26,23 +28,6 @@ LEAST_OTHER = 0.05  # a choice: scanner and fit always add some noise; without i
 _USUAL_POSTURE = np.radians([-90.0, 110.0, -110.0, -90.0, 0.0])  # of the second joint and the others, over a table
 
 
-def observed_document(
-    observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
-) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
-    joints where known."""
-    X = X_FR or RigidTransform()
-    return {
-        "feature_xyz": [float(v) for v in X.translation()],
-        "feature_wxyz": [float(v) for v in X.rotation().ToQuaternion().wxyz()],
-        "xyz": [[float(v) for v in o.p_BR] for o in observations],
-        "wxyz": [[float(v) for v in o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations],
-        "camera": [[float(v) for v in o.p_CR] for o in observations],
-        "normals": [None if o.n_C is None else [float(v) for v in o.n_C] for o in observations],
-        "joints": [[float(v) for v in q] for q in joints],
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class ArmEffect:
     """``effect`` (n, 3, k) m: change of scanned minus touched by each error of the arm of one standard deviation.
@@ -63,8 +48,10 @@ def arm_effect(
     X_BF: Sequence[RigidTransform],
     q_tips: Sequence[Array | None],
 ) -> ArmEffect | None:
-    """Changes of scanned minus touched at n tips (flange poses ``X_BF``, joint angles where known) by k errors of the
-    arm, each of one standard deviation of a maker's (FactoryPrior).
+    """Return changes of scanned minus touched at n tips by k errors of the arm.
+
+    The tips have flange poses ``X_BF``, and joint angles where known. Each error is one standard deviation of a maker's
+    (FactoryPrior).
 
     The calibration has seen the same errors and bent to them: with e = A d + B u at its poses (d: camera pose and
     scanner correction, u: errors of the arm) it finds d = -G u, G = (A' W A + P)^-1 A' W B, and a touch errs by (B_t -
@@ -123,8 +110,10 @@ def arm_effect(
 
 
 def _joints(robot: str, X_BF: Sequence[RigidTransform], known: Sequence[Array | None]) -> Array | None:
-    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up; None out of
-    reach."""
+    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up.
+
+    None out of reach.
+    """
     arm = load_arm(robot)
     p = np.mean([X.translation() for X in X_BF], axis=0)
     near = np.append(np.arctan2(p[1], p[0]) + np.pi, _USUAL_POSTURE)

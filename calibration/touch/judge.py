@@ -1,5 +1,7 @@
-"""Compares touched points with what the calibration states: each error with its 95 % limit, and errors from point to
-point."""
+"""Compares touched points with what the calibration states.
+
+Each error with its 95 % limit, and errors from point to point.
+"""
 
 from __future__ import annotations
 
@@ -47,10 +49,13 @@ _LEAST_FREE = 3.0  # as in eye_on_base/stated_error.py
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchErrors:
-    """Touches (n) judged: ``error_m`` (n,) distance of touched from scanned (signed where it has one direction),
-    ``limit_m`` (n,) of the stated 95 % region in the direction of the error, ``inside`` (n,). ``relative_m`` (n,) is
-    what is left of each error after the shift that the other touches show, ``relative_limit_m`` its stated 95 % limit:
-    NaN where the others show no shift. ``most_outside``: touches that may lie outside by chance."""
+    """Touches (n) judged.
+
+    ``error_m`` (n,) distance of touched from scanned (signed where it has one direction), ``limit_m`` (n,) of the
+    stated 95 % region in the direction of the error, ``inside`` (n,). ``relative_m`` (n,) is what is left of each error
+    after the shift that the other touches show, ``relative_limit_m`` its stated 95 % limit: NaN where the others show
+    no shift. ``most_outside``: touches that may lie outside by chance.
+    """
 
     ids: tuple[str, ...]
     features: tuple[str, ...]
@@ -70,8 +75,9 @@ class TouchErrors:
 
 
 def judge_touches(result: CalibrationResult, touches: Sequence[Touch], kinematics: Path | None = None) -> TouchErrors:
-    """Judge a calibration by touches that it did not use; ``kinematics`` is the file of a result with refined
-    kinematics.
+    """Judge a calibration by touches that it did not use.
+
+    ``kinematics`` is the file of a result with refined kinematics.
 
     The error of touch k in its directions D_k (all three for a point, the normal for a surface touched by a ball) is
     e_k = D_k (touched - scanned) - clearance. Its stated covariance adds pose and scanner correction (and errors of the
@@ -267,8 +273,10 @@ def _marginal(
 
 
 def _without_shift(rows: Array, owner: NDArray[np.int64]) -> Array:
-    """Matrix (m, m) that takes from each touch's errors the shift that the errors of the others show; zero where they
-    show none."""
+    """Matrix (m, m) that takes from each touch's errors the shift that the errors of the others show.
+
+    Zero where they show none.
+    """
     m = len(owner)
     A = np.zeros((m, m))
     for k in np.unique(owner):
@@ -285,8 +293,10 @@ def _without_shift(rows: Array, owner: NDArray[np.int64]) -> Array:
 
 
 def _most_outside(C: Array, owner: NDArray[np.int64], n: int, free: float) -> int:
-    """Number of touches that lie outside in more than 1 - FALSE_ALARM of draws of errors as stated, all that is shared
-    included."""
+    """Return the number of touches outside in more than 1 - FALSE_ALARM of draws of errors as stated.
+
+    The draws have all errors that are shared.
+    """
     rng = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(0.5 * (C + C.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))

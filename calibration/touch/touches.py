@@ -12,7 +12,7 @@ from weldcal.calibration.data.checks import check_reach, row_numbers, table_rows
 from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.robust import TUKEY
+from weldcal.calibration.geometry.robust import MAD, TUKEY
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -92,8 +92,9 @@ def around(points_C: Array, p_C: Array, within_m: float, name: str, least: int =
 
 
 def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
-    """Point (3,) m, unit normal (3,) towards the camera and its standard deviation (m) of the plane through points (n,
-    3).
+    """Fit the plane through points (n, 3), its normal (3,) towards the camera.
+
+    Returns a point (3,) m, the unit normal and the standard deviation (m).
 
     Total least squares with Tukey's weights, the scale from the median. The deviation is that of the plane's distance
     where the points are.
@@ -105,7 +106,7 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
         away = points_C - middle
         n = np.linalg.eigh((away * w[:, None]).T @ away)[1][:, 0]
         e = away @ n
-        scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
+        scale = max(MAD * float(np.median(np.abs(e))), 1e-7)
         w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
     return middle, n if n @ middle < 0.0 else -n, scale / float(np.sqrt(w.sum()))
 
@@ -113,8 +114,9 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
 def fit_touched_sphere(
     points_C: Array, radius_m: float, correction: ScannerCorrection | None = None
 ) -> tuple[Array, float]:
-    """Centre (3,) m, as the scanner gives it, and its standard deviation (m) of a sphere of known radius through points
-    (n, 3) of its near side.
+    """Fit a sphere of known radius through points (n, 3) of its near side.
+
+    Returns its centre (3,) m, as the scanner gives it, and its standard deviation (m).
 
     Gauss-Newton on distances with Tukey's weights; the points are corrected first, because the radius is the true one,
     and the centre is returned uncorrected. The deviation is the largest of the three axes.
@@ -127,7 +129,7 @@ def fit_touched_sphere(
         v = p - c
         d = np.linalg.norm(v, axis=1)
         e, J = d - radius_m, -v / d[:, None]
-        scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
+        scale = max(MAD * float(np.median(np.abs(e))), 1e-7)
         w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
         N = (J * w[:, None]).T @ J
         c = c - np.linalg.solve(N + 1e-9 * np.eye(3), (J * w[:, None]).T @ e)

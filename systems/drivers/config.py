@@ -1,5 +1,7 @@
-"""Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated
-world."""
+"""Base classes of driver configurations.
+
+The devices that a driver supports, and whether it needs the simulated world.
+"""
 
 import dataclasses as dc
 from abc import ABC, abstractmethod
@@ -8,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
 
@@ -15,9 +18,16 @@ DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digi
 """The devices of a station, by their key in the scenario; drivers are applied in this order."""
 
 
+def check_range(key: str, value: float, low: float, high: float) -> None:
+    """Raise InputError for a key of the scenario whose value is not from `low` to `high`."""
+    if not low <= value <= high:
+        raise InputError(f"{key} must be from {low:g} to {high:g}, and it is {value:g}.")
+
+
 class DriverConfig:
-    """Base class of the dataclass that a driver module defines; its name is the tag in the scenario, such as
-    `!SimulatedUr`.
+    """Base class of the dataclass that a driver module defines.
+
+    Its name is the tag in the scenario, such as `!SimulatedUr`.
 
     The module also defines `ApplyDriverConfig(config, build)`. A robot driver may define `PrepareRobot(config,
     nominal)`, and any sensor's driver `preflight(config) -> Sensed`, which looks at the device and causes no motion.
@@ -32,8 +42,7 @@ class DriverConfig:
         return arm
 
     def torch_delay_s(self) -> float:
-        """How long a robot's driver waits from the command of the torch to the torch, s, such as for the shielding
-        gas."""
+        """Time from the command of the torch to the torch, s, such as for the shielding gas."""
         return 0.0
 
 
@@ -55,8 +64,10 @@ class ScannerConfig(DriverConfig, ABC):
         """Intrinsics, range and noise, used by pose planning."""
 
     def stream_delay_s(self) -> float | None:
-        """Nominal time from capture to arrival, s, of a scanner that streams; None for one that scans when it is
-        asked."""
+        """Nominal time from capture to arrival, s, of a scanner that streams.
+
+        None for one that scans when it is asked.
+        """
         return None
 
 

@@ -1,18 +1,26 @@
-"""The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to
-export."""
+"""The interface between drivers and the station builder.
+
+The DiagramBuilder, the station's parts and the ports to export.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
-from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.framework import DiagramBuilder, InputPort, LeafSystem, OutputPort
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.wall_clock import WallClock
 
+ARM_PORTS = tuple(
+    f"arm.{name}"
+    for name in ("velocity_command", "position_measured", "velocity_measured", "X_BF", "sample_time", "status")
+)
+"""The ports that every robot's driver exports."""
 Part = TypeVar("Part")
+SystemOf = TypeVar("SystemOf", bound=LeafSystem)
 
 
 class Closable(Protocol):
@@ -56,8 +64,9 @@ class PreparedRobot:
 
 @dataclass(kw_only=True)
 class StationBuild:
-    """Collects the ports that drivers add; `make_station` exports them under fixed names. `q_start` (6,) rad: the arm's
-    present configuration.
+    """Collects the ports that drivers add; `make_station` exports them under fixed names.
+
+    `q_start` (6,) rad: the arm's present configuration.
 
     `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's
     setup. `closables` are closed with the station.
@@ -76,14 +85,26 @@ class StationBuild:
 
     @property
     def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait
-        for it.
+        """Whether the Diagram may wait for a device.
+
+        It may not while it keeps the pace of a robot that does not wait for it.
 
         Nor while it follows a robot that waits for it: a device of that robot's world may need the robot's time to go
         on.
         """
         clock = None if self.robot is None else self.robot.clock
         return clock is None or (self.robot is not None and self.robot.waits and not clock.follows)
+
+    def add(self, name: str, system: SystemOf, *exported: str) -> SystemOf:
+        """Add a system under its name, and export its ports as the station names them, such as `scanner.trigger`."""
+        self.builder.AddNamedSystem(name, system)
+        for port in exported:
+            own = port.rpartition(".")[2]
+            if system.HasInputPort(own):
+                self.inputs[port] = system.GetInputPort(own)
+            else:
+                self.outputs[port] = system.GetOutputPort(own)
+        return system
 
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""

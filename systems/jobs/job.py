@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Generic, TypeVar
 
@@ -29,6 +30,7 @@ Phases = Sequence[tuple[str, float, float]]
 MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 
+@dataclass(eq=False, kw_only=True)
 class AddedJob(ABC):
     """A job's systems in a cell, as seen by the run loop, the reports and the tests."""
 
@@ -54,14 +56,18 @@ class AddedJob(ABC):
         return np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42])
 
     def can_stand(self, root: Context) -> bool:
-        """Whether the Diagram's time may stand still now: where an operator holds a job that has motion of its own, it
-        rests first."""
+        """Whether the Diagram's time may stand still now.
+
+        Where an operator holds a job that has motion of its own, it rests first.
+        """
         return True
 
     @abstractmethod
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
-        """The present step as text, and the completed share of the run; `phases`: started phases as name, simulated s,
-        wall s."""
+        """The present step as text, and the completed share of the run.
+
+        `phases`: started phases as name, simulated s, wall s.
+        """
 
 
 class Job(ABC, Generic[PlanOf]):

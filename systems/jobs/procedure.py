@@ -14,6 +14,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.motion.spine import JobPorts
 from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, guarded_joint_velocity
 
 ENDS = ("done", "held")
@@ -162,8 +163,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def read(self, *optional: str, **ports: Any) -> None:
-        """Declare further input ports under the inputs' names, each with a value of its type (a number: a vector of
-        one).
+        """Declare further input ports under the inputs' names, each with a value of its type (number: one-vector).
 
         A port among `optional` may stay open: then its value is the one given here.
         """
@@ -174,6 +174,15 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
                 else self.DeclareAbstractInputPort(name, AbstractValue.Make(value))
             )
             self._ports[name] = (port, value if name in optional else None)
+
+    def ports(self, arms: int = 1, **more: Any) -> JobPorts:
+        """The ports that the spine connects, of a job with so many arms; `more` as in JobPorts."""
+        return JobPorts(
+            commands=tuple(self.GetOutputPort(name) for name in self.commands[:arms]),
+            state=self.GetOutputPort(self.state_port),
+            velocity=self.GetOutputPort(self.velocity_port) if self.velocity_port else None,
+            **more,
+        )
 
     def state_in(self, context: Context) -> StateOf:
         """State of the procedure in this system's context."""

@@ -26,8 +26,10 @@ class PoseHistory(Message):
     positions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
 
     def joints_at(self, time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) rad interpolated to `time` s; None where `time` is more than one sample outside the
-        history."""
+        """Joint positions (6,) rad interpolated to `time` s.
+
+        None where `time` is more than one sample outside the history.
+        """
         t = self.times
         if t.size < 2 or not t[0] <= time <= t[-1] + (t[-1] - t[-2]):
             return None
@@ -77,8 +79,7 @@ class PoseRecorder(LeafSystem):
 
 @dc.dataclass(frozen=True, eq=False)
 class Queue(Message):
-    """The frame that the reader has, those that wait, oldest first, the number of the newest frame that came, and those
-    dropped."""
+    """The frame that the reader has, those that wait, oldest first, the newest frame's number, and those dropped."""
 
     served: StreamedScan = dc.field(default_factory=StreamedScan)
     waiting: tuple[StreamedScan, ...] = ()

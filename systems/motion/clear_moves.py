@@ -29,8 +29,10 @@ def station_bodies(station: Station) -> list[LinkCapsule]:
 
 
 def clear_move(scenario: Scenario, station: Station, bodies: list[LinkCapsule], q_a: Joints, q_b: Joints) -> bool:
-    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself;
-    (6,) rad."""
+    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself.
+
+    (6,) rad.
+    """
     if station.surroundings.touched_on_path(station.arm, bodies, q_a, q_b):
         return False
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)

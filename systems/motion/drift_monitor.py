@@ -59,8 +59,10 @@ class RunClock:
 
 @dc.dataclass(frozen=True, eq=False)
 class Seen:
-    """What a clock is learnt with: the calibration, the arm and where the feature is on its flange, and the arm's
-    recent motion."""
+    """What a clock is learnt with.
+
+    The calibration, the arm and where the feature is on its flange, and the arm's recent motion.
+    """
 
     X_BC: RigidTransform
     correction: ScannerCorrection
@@ -110,9 +112,12 @@ def followed(
 
 
 def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:
-    """The clock after a frame with a fit, and the frames that can be used now: at rest each at once, because no time is
-    wrong there; in motion those that waited, once they show the clock. One that has left the history is given up. By a
-    clock that is learnt only a very late frame waits, for the next: then it was late, and the clock is right."""
+    """The clock after a frame with a fit, and the frames that can be used now.
+
+    At rest each at once, because no time is wrong there; in motion those that waited, once they show the clock. One
+    that has left the history is given up. By a clock that is learnt only a very late frame waits, for the next: then it
+    was late, and the clock is right.
+    """
     assert estimate.device_time is not None
     if clock.learnt and clock.late_since is not None:
         return dc.replace(clock, waiting=(*clock.waiting, estimate)), ()
@@ -172,8 +177,11 @@ _RECENT = 400  # frames that the view shows
 
 @dc.dataclass(frozen=True, eq=False)
 class MonitoredCalibration:
-    """What is watched: X_BC with its covariance (6, 6) [rotation; translation] about the camera's origin, the scanner's
-    correction and its clock. Without a clock a streamed frame was captured ``delay_s`` before its arrival."""
+    """What is watched: X_BC with its covariance (6, 6), the scanner's correction and its clock.
+
+    The covariance is [rotation; translation] about the camera's origin. Without a clock a streamed frame was captured
+    ``delay_s`` before its arrival.
+    """
 
     X_BC: RigidTransform
     covariance: Array
@@ -184,8 +192,10 @@ class MonitoredCalibration:
 
     @staticmethod
     def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
-        """What a result says; ``delay_s`` is the usual delay of the scanner, where the result does not know its
-        clock."""
+        """The monitored calibration of a result.
+
+        ``delay_s`` is the usual delay of the scanner, where the result does not know its clock.
+        """
         clock = result.clock
         sigma = None if clock is None or clock.offset_s is None else clock.sigma_s
         spread = 1e-3 * result.sigma_position_mm

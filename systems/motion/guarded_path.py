@@ -23,8 +23,7 @@ _BESIDE_RAD = 0.2  # farther than this from where its speeds lead a joint has ch
 
 
 class SingularityGuard(LeafSystem):
-    """Maps a spatial velocity of the tip frame to joint velocities within the arm's speed limits, and stops it before a
-    singularity.
+    """Maps the tip's spatial velocity to joint velocities within the limits; stops before a singularity.
 
     .. pydrake_system::
 
@@ -111,8 +110,10 @@ class GuardedMotion:
 
 
 class Followed(NamedTuple):
-    """How the arm follows a motion: joints (n, 6) rad, their places (n,) m, the least singular value and share of the
-    speed."""
+    """How the arm follows a motion.
+
+    Joints (n, 6) rad, their places (n,) m, the least singular value and share of the speed.
+    """
 
     q: Array
     along: Array

@@ -1,5 +1,7 @@
-"""Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process
-switch."""
+"""Builds the spine shared by all jobs.
+
+Pose recorder, mover, arbiter and limiter for each arm, operator hold, process switch.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -250,8 +252,10 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it;
-    `switch` outputs `process_on` and `arm_stopped`."""
+    """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it.
+
+    `switch` outputs `process_on` and `arm_stopped`.
+    """
 
     wiring: Wiring
     arms: tuple[SpineArm, ...]
@@ -263,6 +267,19 @@ class Spine:
     def arm(self) -> SpineArm:
         """The first arm."""
         return self.arms[0]
+
+    def serve(self, procedure: LeafSystem, **sources: OutputPort) -> None:
+        """Connect the ports of a job's procedure: those that the spine knows by their names, and `sources`."""
+        first = self.arm
+        known = {
+            **dict.fromkeys(("position_measured", "position"), first.position),
+            "settled_goal": first.settled_goal,
+            "robot_status": first.status,
+            "history": first.history,
+            "hold": self.end,
+        }
+        known = {name: port for name, port in known.items() if procedure.HasInputPort(name)}
+        self.wiring.connect(procedure, **known, **sources)
 
     def connect(self, job: JobPorts) -> None:
         """Connect the ports of the job."""

@@ -1,5 +1,4 @@
-"""PortPlayer: outputs what a recording holds of a station's ports, each value at the moment of a tick at which it was
-seen."""
+"""Output what a recording holds of a station's ports, each value at the moment of a tick at which it was read."""
 
 from __future__ import annotations
 
@@ -32,8 +31,10 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """What a station plays back: tracks of its output ports, sizes of its input ports, and looks by question
-    (answers.py)."""
+    """What a station plays back.
+
+    Tracks of its output ports, sizes of its input ports, and looks by question (answers.py).
+    """
 
     tracks: Mapping[str, Track]
     inputs: Mapping[str, int]
@@ -89,7 +90,6 @@ class PortPlayer(LeafSystem):
 
 def add_player(played: Playback, build: StationBuild) -> None:
     """Add a player to a station in place of its devices."""
-    player = build.builder.AddSystem(PortPlayer(played.tracks, played.inputs))
-    player.set_name("player")
+    player = build.builder.AddNamedSystem("player", PortPlayer(played.tracks, played.inputs))
     build.inputs |= {name: player.GetInputPort(name) for name in played.inputs}
     build.outputs |= {name: player.GetOutputPort(name) for name in played.tracks}

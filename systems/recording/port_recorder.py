@@ -1,5 +1,4 @@
-"""PortRecorder: gives every change of the ports that a cell reads and drives to a sink, in the order in which Drake
-made it."""
+"""Give every change of the ports that a cell reads and drives to a sink, in the order in which Drake made it."""
 
 from __future__ import annotations
 

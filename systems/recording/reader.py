@@ -33,8 +33,7 @@ _PLAYED = {
 
 @dataclass(frozen=True)
 class Left:
-    """What left the cell: one value (as JSON) of one port or result, the key at which it did, and its number in the
-    file."""
+    """One value (as JSON) of a port or result that left the cell, its key, and its number in the file."""
 
     number: int
     key: int
@@ -204,8 +203,10 @@ def _with(kind: Any, value: dict[str, Any], name: str, body: np.ndarray | None) 
 
 @dataclass(frozen=True)
 class Difference:
-    """A value that is another one than in the recording: its port and field, the time s, and the number of its
-    message."""
+    """A value that is another one than in the recording.
+
+    Its port and field, the time s, and the number of its message.
+    """
 
     name: str
     time_s: float
@@ -219,8 +220,7 @@ class Difference:
 
 
 class Comparison:
-    """A CellSink that compares with a recording up to its newest complete tick, and keeps the first difference of each
-    port."""
+    """Compares with a recording up to its newest complete tick; keeps the first difference of each port."""
 
     def __init__(self, recording: Recording, sizes: Mapping[str, int]) -> None:
         self._recording, self._sizes = recording, sizes

@@ -264,8 +264,10 @@ class _In:
 
 
 def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytearray:
-    """An organised cloud (H, W, 3) of float32 or float64, NaN where there is no point, as
-    sensor_msgs/msg/PointCloud2."""
+    """An organised cloud (H, W, 3), NaN where there is no point, as sensor_msgs/msg/PointCloud2.
+
+    The numbers are float32 or float64.
+    """
     out, kind = _Out(), _FLOATS[points.dtype]
     step = 3 * points.dtype.itemsize
     out.header(time_ns, frame)

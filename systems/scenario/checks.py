@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.models.workpieces.reading import LARGEST_SIZE_M
-from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.config import NoDevice, check_range
 from weldcal.systems.jobs.job import job_of, jobs
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
@@ -109,10 +109,6 @@ def check_numbers(config: Any, place: str = "") -> None:
                 check_numbers(item, f"{key}[{k}].")
             continue
         _check_type(key, field.type, value)
-        if isinstance(value, list) and value and dc.is_dataclass(value[0]):
-            for number, item in enumerate(value):
-                check_numbers(item, f"{key}[{number}].")
-            continue
         if isinstance(value, list) and len(value) != LENGTHS.get(field.name, len(value)):
             raise InputError(f"{key} must hold {LENGTHS[field.name]} numbers, not {len(value)}.")
         for number in value if isinstance(value, list) else [value]:
@@ -121,8 +117,10 @@ def check_numbers(config: Any, place: str = "") -> None:
 
 
 def _check_type(key: str, kind: Any, value: Any) -> None:
-    """Refuses a word where a number belongs: Drake's YAML reader converts plain types, and leaves an optional one as it
-    was."""
+    """Refuses a word where a number belongs.
+
+    Drake's YAML reader converts plain types, and leaves an optional one as it was.
+    """
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
     if value is None and NoneType not in kinds:
         raise InputError(f"{key} has no value; write one, or omit the key.")
@@ -271,10 +269,7 @@ def check_scenario(scenario: Scenario) -> None:
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
     scenario.planning.planning_method()
-    if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
-        raise InputError(
-            f"job.speed_factor must be from {SLOWEST_FACTOR:g} to 1, and it is {scenario.job.speed_factor:g}."
-        )
+    check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")

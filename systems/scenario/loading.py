@@ -184,8 +184,10 @@ def _use_camera_of(scenario: Scenario) -> None:
 
 
 def _part_at_fault(text: str) -> str:
-    """The top-level part of a YAML text that does not load by itself, as a phrase for a message; empty where not
-    found."""
+    """The top-level part of a YAML text that does not load by itself, as a phrase for a message.
+
+    Empty where not found.
+    """
     schema = scenario_class()
     parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
     for part in filter(str.strip, parts):

@@ -136,8 +136,9 @@ def part_of(spec: WorkpieceConfig) -> Part:
 
 
 def legs(shape: PartShape, source: SeamSource, joint: str) -> list[DrawnSeam]:
-    """A seam as drawn, or its legs between sharp outside corners, as those of a square tube: across one, tip and torch
-    cannot both follow.
+    """A seam as drawn, or its legs between sharp outside corners, as those of a square tube.
+
+    Across one, tip and torch cannot both follow.
 
     Raises:
         InputError: as seam_of.

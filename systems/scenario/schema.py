@@ -56,20 +56,17 @@ class CalibrationConfig:
 
     configuration: str = "eye_on_base"  # or eye_in_hand, eye_on_arm_target_on_flange, ..._on_base, co_manipulation
     feature: str = "tool_ring"  # tool_ring: the ring on the welding tool; flange: the bare flange
-    mounting_guess: PoseConfig = dc.field(
-        default_factory=PoseConfig
-    )  # nominal X_BC (X_FC, X_LC), such as measured with a tape
+    # nominal X_BC (X_FC, X_LC), such as measured with a tape
+    mounting_guess: PoseConfig = dc.field(default_factory=PoseConfig)
     guess_radius_mm: float = 60.0  # largest distance of the feature from its predicted position
     theta_max_deg: float = 25.0  # between the feature's normal and the line of sight
-    required_error_mm: float = (
-        0.10  # e_required, for the estimate's expected error at the work point; in a mounting job for its bound at 95 %
-    )
+    # e_required, for the estimate's expected error at the work point; in a mounting job for its bound at 95 %
+    required_error_mm: float = 0.10
     minimum_scans: int = 6
     maximum_scans: int = 10  # k_max, without the verification scans
     correct_scanner: bool = True  # estimate scale, gradient and bends of the scanner with X_BC
-    refine: str = (
-        "none"  # none, local, joints or links: as calibrate --refine, after the last scan; needs 10 scans (local) or 12
-    )
+    # none, local, joints or links: as calibrate --refine, after the last scan; needs 10 scans (local) or 12
+    refine: str = "none"
     verification_scans: int = 1
     verification_limit_mm: float = 0.5  # a larger error at a held-out pose holds the job
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
@@ -110,9 +107,8 @@ class WorkpieceConfig:
     located_by: str = "scan"  # scan: register the CAD to the scan; drawing: use the fixture's drawing
     placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # deviation of the plate on the fixture
     groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # deviation of the groove from the plate's datums
-    hole_from_mm: float | None = (
-        None  # from this arc length on the true groove has no walls, which the scan does not show: contact is lost
-    )
+    # from this arc length on the true groove has no walls, which the scan does not show: contact is lost
+    hole_from_mm: float | None = None
 
 
 @dc.dataclass

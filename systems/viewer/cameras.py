@@ -145,8 +145,10 @@ class CameraDirector(LeafSystem):
         self._last, self._views.showing = (view, eye, target), view
 
     def _report(self) -> Array | None:
-        """The camera (3,) m of the browser that changed last; None where no browser has reported since the last
-        call."""
+        """The camera (3,) m of the browser that changed last.
+
+        None where no browser has reported since the last call.
+        """
         X_WCamera = self._meshcat.GetTrackedCameraPose()
         if X_WCamera is None:
             return None
@@ -161,8 +163,10 @@ class CameraDirector(LeafSystem):
         return bool(self._put) and float(np.linalg.norm([*self._put, *START_M] - p, axis=1).min()) > MOVED_M
 
     def _reloaded(self, p: Array) -> bool:
-        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it: its page was reloaded after it
-        was moved."""
+        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it.
+
+        Its page was reloaded after it was moved.
+        """
         given = [*START_M, *([self._put[-1]] if self._put else [])]
         only = self._meshcat.GetNumActiveConnections() <= 1
         return only and float(np.linalg.norm(given - p, axis=1).min()) < 1e-3
@@ -191,8 +195,10 @@ class CameraDirector(LeafSystem):
 
 
 def scanner_view(X_BC: RigidTransform) -> tuple[Array, Array]:
-    """Eye and target (3,) m in B of the scanner's own view; a little aside, so that the picture's upper edge
-    is up: a viewer cannot look straight down."""
+    """Eye and target (3,) m in B of the scanner's own view.
+
+    A little aside, so that the picture's upper edge is up: a viewer cannot look straight down.
+    """
     R, target = X_BC.rotation().matrix(), np.asarray(X_BC @ np.array([0.0, 0.0, _LOOKS_M]))
     along = R[:, 2]
     if abs(along[2]) > 0.95:
@@ -202,8 +208,9 @@ def scanner_view(X_BC: RigidTransform) -> tuple[Array, Array]:
 
 
 def seam_view(seam: SeamCurve | None, at: Array | None, work_B: Array) -> tuple[Array, Array]:
-    """Eye and target (3,) m in B of the camera at the seam: square to its chord, on the side away from the robot, above
-    it.
+    """Eye and target (3,) m in B of the camera at the seam.
+
+    Square to its chord, on the side away from the robot, above it.
 
     Before there is a seam it looks at `work_B`; before the tool is at the seam (`at` None), at the seam's middle.
     """
@@ -223,8 +230,10 @@ def seam_view(seam: SeamCurve | None, at: Array | None, work_B: Array) -> tuple[
 
 
 def add_cameras(wiring: Wiring, ports: JobPorts, cell: tuple[Array, Array], views: Views) -> CameraDirector:
-    """Add the director of the viewer's camera; the scanner's eye where it is fixed in the base, the seam's camera where
-    one is welded."""
+    """Add the director of the viewer's camera.
+
+    The scanner's eye where it is fixed in the base, the seam's camera where one is welded.
+    """
     assert wiring.meshcat is not None
     station, scenario = wiring.station, wiring.scenario
     models = {name: port.Allocate() for name, port in ports.shown.items()}

@@ -1,5 +1,7 @@
-"""CellVisualizer: shows the weld job's estimates in Meshcat: view cone, clouds by residual, circles, uncertainty,
-seams, torch."""
+"""CellVisualizer: shows the weld job's estimates in Meshcat.
+
+View cone, clouds by residual, circles, uncertainty, seams, torch.
+"""
 
 from dataclasses import dataclass, field
 
@@ -121,9 +123,8 @@ class CellVisualizer(LeafSystem):
 
     def _prepare(self, context: Context) -> EventStatus:
         for path in (*WITH_FLANGE, *WITH_SCANS):
-            self._meshcat.SetProperty(
-                path, "visible", True, 0.0
-            )  # a recording shows an item's first value from its begin on
+            # a recording shows an item's first value from its begin on
+            self._meshcat.SetProperty(path, "visible", True, 0.0)
         draw_triad(self._meshcat, f"{GUESS}/triad", dashed=True)
         self._meshcat.SetTransform(f"{GUESS}/triad", self._X_BC_guess)
         self._sign(f"{GUESS}/sign", "guess", _CAMERA_SIGN, self._beside(self._X_BC_guess, 0.14))

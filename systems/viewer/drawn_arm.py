@@ -25,13 +25,13 @@ def add_drawn_arm(
     position_measured: OutputPort,
     surroundings: Surroundings,
 ) -> SceneGraph:
-    """Add a scene with arm, tool (tip at rest), table, its top's frame at `table` in B, and surroundings; frame: the
-    world is the base B.
+    """Add a scene with arm, tool (tip at rest), table, its top's frame at `table` in B, and surroundings.
+
+    Frame: the world is the base B.
 
     `position_measured` (6) rad sets the arm's pose. The scene has no dynamics, no contact and no rendered sensors.
     """
-    scene_graph = builder.AddSystem(SceneGraph())
-    scene_graph.set_name("scene_graph")
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     plant = MultibodyPlant(time_step=0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     (instance,) = Parser(plant).AddModelsFromString(arm_urdf(arm), "urdf")
@@ -42,8 +42,7 @@ def add_drawn_arm(
     show(plant, plant.world_body(), table @ RigidTransform([0.0, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
     add_surroundings(plant, surroundings)
     plant.Finalize()
-    poses = builder.AddSystem(MultibodyPositionToGeometryPose(plant))
-    poses.set_name("drawn_poses")
+    poses = builder.AddNamedSystem("drawn_poses", MultibodyPositionToGeometryPose(plant))
     rest = plant.num_positions() - len(arm.joint_names)
     if rest:
         joints = builder.AddSystem(Multiplexer([len(arm.joint_names), rest]))

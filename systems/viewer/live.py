@@ -1,5 +1,7 @@
-"""LiveView: what the dashboard shows of a running cell; a thin system writes it, other threads read it without a
-lock."""
+"""LiveView: what the dashboard shows of a running cell.
+
+A thin system writes it, other threads read it without a lock.
+"""
 
 import math
 from collections.abc import Mapping
@@ -25,8 +27,11 @@ ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
 
 
 class WeldRow(NamedTuple):
-    """One row of the weld's plots: time s, torch and tip along the seam m, the felt seam to the left of the planned one
-    m, deflection m, torch speed m/s, whether the torch is on; NaN where there is no value."""
+    """One row of the weld's plots.
+
+    Time s, torch and tip along the seam m, the felt seam to the left of the planned one m, deflection m, torch speed
+    m/s, whether the torch is on; NaN where there is no value.
+    """
 
     time: float
     s_torch: float
@@ -47,8 +52,11 @@ class ScanRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The values of one moment: Diagram time s, the job's command, its shown messages by name, and the arm's least
-    singular value (NaN where the job has none)."""
+    """The values of one moment.
+
+    Diagram time s, the job's command, its shown messages by name, and the arm's least singular value (NaN where the job
+    has none).
+    """
 
     time: float = 0.0
     command: JobCommand = field(default_factory=JobCommand)

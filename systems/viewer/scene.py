@@ -34,8 +34,10 @@ _PAPER = (255, 255, 255)
 
 
 class Uncertainty(NamedTuple):
-    """The 3-sigma ellipsoid of a scanned point: half axes (3,) m, their directions (3, 3) in B as columns, and the
-    magnification at which it is drawn."""
+    """The 3-sigma ellipsoid of a scanned point.
+
+    Half axes (3,) m, their directions (3, 3) in B as columns, and the magnification at which it is drawn.
+    """
 
     half_axes: Array
     R_BE: Array
@@ -61,8 +63,10 @@ class LegendKey(NamedTuple):
 
 
 def legend(phase: str, magnification: int | None = None) -> list[LegendKey]:
-    """The legend of a phase of the weld job; `magnification` of the drawn uncertainty, 0 where it is written beside it,
-    None where there is none yet."""
+    """The legend of a phase of the weld job.
+
+    `magnification` of the drawn uncertainty, 0 where it is written beside it, None where there is none yet.
+    """
     if phase in WELDING_PHASES:
         return [
             LegendKey(_css(PLANNED), "dashed", "planned seam"),

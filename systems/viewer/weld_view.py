@@ -1,5 +1,7 @@
-"""Draws the weld's progress in Meshcat: CAD edges, planned, felt and welded seam, an arrow beside the tip for its
-deflection."""
+"""Draws the weld's progress in Meshcat.
+
+CAD edges, planned, felt and welded seam, an arrow beside the tip for its deflection.
+"""
 
 import math
 
@@ -19,8 +21,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def outline(mesh: TriMesh, least_angle_rad: float = math.radians(20.0)) -> tuple[Floats, Floats]:
-    """Starts and ends (N,3) m of the edges whose two faces turn by more than the least angle, or that have one face
-    only.
+    """Starts and ends (N, 3) m of the edges with one face, or whose faces turn by more than the least angle.
 
     Args:
         mesh: faces that meet share their vertices (as TriMesh's makers do).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -156,38 +157,71 @@ def test_an_installed_wheel_works_far_from_the_repository(built: Built, tmp_path
 
 
 USER_PROGRAM = """
-import weldcal, weldcal.added
+import weldcal, weldcal.calibration, weldcal.welding, weldcal.systems
 weldcal.nothing
-weldcal.added.found
+weldcal.calibration.nothing
+weldcal.welding.nothing
+weldcal.systems.nothing
 reveal_type(weldcal.__version__)
+reveal_type(weldcal.read_calibration("my_result").correct)
 """
-# The functions' own modules are left out, which saves their minute.
+ADDED = "import weldcal.added\nreveal_type(weldcal.added.found)\n"
+# mypy follows the packages only, not the modules of their names, which saves a minute.
 FAST = """
-[mypy]
-[mypy-weldcal.tools.*]
+[mypy-weldcal.models.*,weldcal.calibration.*,weldcal.welding.*,weldcal.systems.*,weldcal.tools.*]
 follow_imports = skip
+[mypy-weldcal.calibration,weldcal.welding,weldcal.systems]
+follow_imports = normal
 """
 
 
-def test_type_checkers_find_an_editable_install(built: Built, tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", "env"], check=True, cwd=tmp_path, timeout=60)
-    python = tmp_path / "env" / "bin" / "python"
-    (site,) = (tmp_path / "env" / "lib").glob("python*/site-packages")
+def installed(built: Built, folder: Path, kind: str) -> Path:
+    """The Python of a new environment with weldcal, installed from the wheel or from its editable folder."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True, timeout=60)
+    python = folder / "bin" / "python"
+    (site,) = (folder / "lib").glob("python*/site-packages")
     libraries = [path for path in sys.path if path.endswith("site-packages")]
     (site / "libraries.pth").write_text("\n".join(libraries))
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--editable", str(built.copy)]
+    source = [str(built.wheel)] if kind == "wheel" else ["--no-build-isolation", "--editable", str(built.copy)]
+    options = ["--quiet", "--no-compile", "--no-deps", "--no-index", "--ignore-installed", *source]
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", *options]
     subprocess.run(install, check=True, capture_output=True, timeout=120)
-    (built.copy / "added.py").write_text("found: int = 1\n")
-    (tmp_path / "user.py").write_text(USER_PROGRAM)
+    return python
+
+
+def checked(arguments: list[str], folder: Path) -> str:
+    """What a type checker finds in a folder far from the repository."""
+    hidden = ("PYTHONPATH", "MYPYPATH")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [sys.executable, "-P", "-m", *arguments]
+    return subprocess.run(
+        command, env=environment, cwd=folder, capture_output=True, text=True, check=False, timeout=300
+    ).stdout
+
+
+@pytest.mark.parametrize("kind", ["wheel", "editable"])
+def test_type_checkers_of_a_users_project_find_weldcal(built: Built, tmp_path: Path, kind: str) -> None:
+    python = installed(built, tmp_path / "env", kind)
+    program = USER_PROGRAM
+    if kind == "editable":  # a module that was added after the install
+        (built.copy / "added.py").write_text("found: int = 1\n")
+        program += ADDED
+    (tmp_path / "user.py").write_text(program)
     (tmp_path / "mypy.ini").write_text(FAST)
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
-    command = [sys.executable, "-P", "-m", "mypy", "--python-executable", str(python), "user.py"]
-    checked = subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
-    )
-    lines = [line.split(":", 1)[1] for line in checked.stdout.splitlines() if line.startswith("user.py")]
+    by_mypy = checked(["mypy", "--python-executable", str(python), "user.py"], tmp_path)
+    lines = [line.split(":", 1)[1] for line in by_mypy.splitlines() if line.startswith("user.py")]
     assert lines == [
-        '3: error: Module has no attribute "nothing"  [attr-defined]',
-        '5: note: Revealed type is "str"',
-    ], "with a file that was added after the install\n" + checked.stdout
+        *(f'{line}: error: Module has no attribute "nothing"  [attr-defined]' for line in (3, 4, 5, 6)),
+        '7: note: Revealed type is "str"',
+        '8: note: Revealed type is "Any"',  # its module is not followed
+        *(['10: note: Revealed type is "int"'] if kind == "editable" else []),
+    ], by_mypy
+    by_pyright = json.loads(checked(["basedpyright", "--outputjson", "--pythonpath", str(python), "user.py"], tmp_path))
+    notes = by_pyright["generalDiagnostics"]
+    unknown = [note["range"]["start"]["line"] for note in notes if note.get("rule") == "reportAttributeAccessIssue"]
+    assert [line + 1 for line in unknown] == [3, 4, 5, 6], notes
+    revealed = [note["message"].split(" is ", 1)[1] for note in notes if note["severity"] == "information"]
+    assert revealed[0] == '"str"'
+    assert revealed[1].startswith('"(points_C: ')
+    assert ") -> ndarray[" in revealed[1]
+    assert "Unknown" not in revealed[1]

@@ -37,11 +37,13 @@ def test_every_page_is_built_and_loads_nothing_from_a_network(site: Path) -> Non
         assert outside == [], page
 
 
-def test_the_four_parts_are_in_the_navigation(site: Path) -> None:
+def test_the_six_parts_are_in_the_navigation(site: Path) -> None:
     text = (site / "arms.html").read_text()
     assert re.findall(r'<li class="toctree-l1[^>]*><a[^>]*>([^<]+)</a>', text) == [
-        "The first hour",
+        "Start: the first hour",
+        "Tutorials",
         "How-to",
+        "Concepts",
         "Methods",
         "Reference",
     ]

@@ -227,7 +227,7 @@ def bench() -> Iterator[Bench]:
 def burning(bench: Bench) -> Iterator[Bench]:
     """The arm at full speed, the torch on, with an arc."""
     bench.start()
-    assert bench.stream.state.arc is False
+    assert bench.stream.state.arc == 0
     bench.stream.process = True
     bench.cruise()
     until = time.monotonic() + 2.0
@@ -237,9 +237,9 @@ def burning(bench: Bench) -> Iterator[Bench]:
     assert state["digital_outputs"] >> OUTPUT & 1
     assert state["analog_outputs"] == pytest.approx(SHOWN)
     bench.emulator.do("set_digital_in", n=ARC)
-    while bench.stream.state.arc is not True and time.monotonic() < until:
+    while bench.stream.state.arc != 1 and time.monotonic() < until:
         time.sleep(0.002)
-    assert bench.stream.state.arc
+    assert bench.stream.state.arc == 1
     yield bench
     bench.end(kill=True)
     recover(bench)

@@ -96,7 +96,7 @@ def break_session(controller: Controller, fault: Fault, **settings: Any) -> Brok
             link.command(np.full(6, 0.1))  # a cell that would go on
             time.sleep(0.01)
         state = controller.state()
-        late = state["late"]["slips"] > slips or link.state().worst_period_s > LATE_S
+        late = state["late"]["slips"] > slips or link.state().worst_period > LATE_S
     controller.do("stop")
     controller.rests(2.0)
     assert found, "the arm did not come to rest"

@@ -28,6 +28,7 @@ from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.verify import VerifyReport
 
 DATA = SHARED_DATA / "flange"
@@ -195,6 +196,21 @@ def test_another_robot_flange_or_scanner_is_named(halves: tuple[Path, Path], tmp
         ("scanner", "phoxi_s", "phoxi_m"),
     ):
         assert any(f"{what} '{was}', these scans with '{now}'" in w for w in report.warnings)
+
+
+def test_another_arm_is_the_first_words_of_a_verdict(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    few = _few(halves, tmp_path / "few", 5)
+    header = (few / "dataset.yaml").read_text()
+    (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5"))
+    named = "The calibration was made with the robot 'aubo_i5', these scans with 'ur5'."
+    report = verify_dataset(halves[0], few, tmp_path / "out", limit_mm=1e-3)
+    assert report.verdict.verdict == DO_NOT
+    assert report.verdict.reason.startswith(named)
+    assert report.warnings[0].startswith(named)
+    for cloud in (few / "clouds").iterdir():
+        cloud.write_bytes(b"")
+    with pytest.raises(InputError, match=f"^{named} .* None of the 5 scans can be used"):
+        verify_dataset(halves[0], few, tmp_path / "none")
 
 
 def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import DisplacedStand, PicturePoses
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
     CheatTorch,
@@ -229,7 +229,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
         (),
     ),
     ProfilerSensor: lambda: ProfilerSensor(RenderedProfiler(), profiler_fixture(), BodyIndex(7), 0, 0.004),
-    TouchSensor: lambda: TouchSensor(TouchPair(GeometryId.get_new_id(), GeometryId.get_new_id()), 0.004),
+    TouchSensor: lambda: TouchSensor(frozenset(), 0.004),
     CheatTorch: lambda: CheatTorch(profiler_fixture(), BodyIndex(7)),
     RobotError: lambda: RobotError(the_arm(), 6e-5, 0),
     ProfilerProcedure: lambda: ProfilerProcedure(profiler_planning(), RenderedProfiler(), 0),

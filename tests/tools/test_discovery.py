@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from weldcal.tools import commands
 from weldcal.tools.cli.app import GROUPS, build_app
-from weldcal.tools.cli.discovery import find_commands, other_command
+from weldcal.tools.cli.discovery import ON_DEMAND, find_commands, on_demand, other_command
 
 MODULE = '''"""A command of a test."""
 
@@ -102,3 +102,8 @@ def test_another_command_is_found_by_its_name() -> None:
     assert other_command("view").title == "view"
     with pytest.raises(KeyError):
         other_command("dance")
+
+
+@pytest.mark.parametrize("name", ON_DEMAND)
+def test_a_function_on_demand_is_found_by_its_name(name: str) -> None:
+    assert on_demand(name).__name__ == name

@@ -209,6 +209,8 @@ def test_a_part_without_seams_says_so(tmp_path: Path) -> None:
     write_step(box((0, 0, 0), (100, 60, 10)), tmp_path / "plate.step")
     text = CliRunner().invoke(app, ["part", str(tmp_path / "plate.step"), "--out", str(tmp_path / "out")]).stdout
     assert "No seams are listed: no two bodies meet" in text
+    assert "Pick by number" not in text
+    assert "Picture: " in text
 
 
 def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:

@@ -74,3 +74,19 @@ def test_the_advice_of_a_refusal_leads_to_the_calibration(
     _, done = asked("calibrate", folder, "--out", tmp_path / "out", "--json")
     X = np.array(done["X_BC"])
     assert 1e3 * np.linalg.norm(X[:3, 3] - [0.66, 0.02, 0.94]) < 0.5
+
+
+@pytest.mark.parametrize("order", ["yxz", "zyx", "xzy"])
+def test_a_header_that_exchanges_two_positions_is_named(tmp_path: Path, order: str) -> None:
+    folder = written(tmp_path / "scans", lambda row: [row[k] for k in ("id", "x", "y", "z", "qw", "qx", "qy", "qz")])
+    table = folder / "poses.csv"
+    text = table.read_text()
+    table.write_text(text.replace("id,x,y,z", f"id,{','.join(order)}"))
+    _, refused = asked("calibrate", folder, "--out", tmp_path / "out", "--json")
+    first, second = [axis for axis, place in zip("xyz", order, strict=True) if axis != place]
+    reason = str(refused["reason"])
+    assert f"the columns {first} and {second} of the poses are exchanged" in reason
+    assert "Name the columns in the header" in reason
+    table.write_text(text)
+    _, done = asked("calibrate", folder, "--out", tmp_path / "out", "--json", "--overwrite")
+    assert done["state"] == "done"

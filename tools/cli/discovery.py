@@ -7,15 +7,22 @@ A module is imported when its command is called. Until then only the text of its
 import ast
 import importlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from weldcal.tools.cli.options import CliCommand
 
 PACKAGES = ("weldcal.tools.commands", "weldcal.tools.studies", "weldcal.tools.cli")
 """Packages whose modules, at any depth, may hold commands."""
+
+ON_DEMAND = {
+    "compare_algorithm1": "weldcal.tools.commands.algorithm1_comparison",
+    "name_cause": "weldcal.tools.report.doctor",
+}
+"""Functions that few calls of a command need, such as for one option, and their modules."""
 
 DECORATOR = re.compile(r"^@command(\([^@]*?\))\n(?:@one_of\([^@]*?\)\n)?def ", re.MULTILINE | re.DOTALL)
 
@@ -76,3 +83,9 @@ def other_command(title: str) -> CliCommand:
         KeyError: there is no such command.
     """
     return _known()[title].load()
+
+
+def on_demand(name: str) -> Callable[..., Any]:
+    """Find a function of ON_DEMAND; imports its module."""
+    function: Callable[..., Any] = getattr(importlib.import_module(ON_DEMAND[name]), name)
+    return function

@@ -1,5 +1,4 @@
-"""Makes one command of several studies of a subject: `--what WORD` chooses, and each old command stays as a hidden
-one."""
+"""Make one command of several studies of a subject: `--what WORD` chooses; each old command stays, hidden."""
 
 import copy
 import inspect

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.clouds import cloud_id, read_cloud
-from weldcal.calibration.data.results import ON_BASE, CalibrationResult, load_result
+from weldcal.calibration.data.results import load_correction, load_result
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
@@ -36,7 +37,8 @@ def apply(
     ] = "",
 ) -> Outcome:
     """Correct a scan for the scanner's own errors, as the calibration found them; --base: also map it into the base."""
-    found = load_result(result)
+    correction = load_correction(result)
+    X_BC = load_result(result).X_BC if base else RigidTransform()
     to = to or Path(f"{cloud_id(cloud)}_{'base' if base else 'corrected'}.ply")
     if to.suffix.lower() not in FORMS:
         raise InputError(f"'{to.name}' has no form that can be written: end its name with {', '.join(FORMS)}.")
@@ -46,8 +48,10 @@ def apply(
         raise InputError(f"--unit must be m or mm, not '{unit}'.")
     given = read_cloud(cloud)
     length = {"m": 1.0, "mm": 1e-3}[unit or ("mm" if np.nanmedian(np.abs(given[..., 2])) > FARTHEST_M else "m")]
-    points = applied(found, length * given, base=base)
-    moved = 1e3 * np.nanmean(np.linalg.norm(found.correct(length * given) - length * given, axis=-1))
+    measured = length * given
+    corrected = measured if correction is None else correction.points(measured)
+    points = corrected @ X_BC.rotation().matrix().T + X_BC.translation()
+    moved = 1e3 * np.nanmean(np.linalg.norm(corrected - measured, axis=-1))
     write_points(to, points / length)
     frame = "robot's base B" if base else "scanner C"
     values = {
@@ -55,28 +59,10 @@ def apply(
         "unit": "m" if length == 1.0 else "mm",
         "frame": frame,
         "mean_correction_mm": float(moved),
-        "note": "" if found.scanner_correction else "This calibration has no scanner correction: no point changed.",
+        "note": "" if correction else "This calibration has no scanner correction: no point changed.",
         "file": str(to),
     }
     return Outcome({"state": "done", **values}, values=values)
-
-
-def applied(result: CalibrationResult, points_C: Array, *, base: bool = False) -> Array:
-    """Points (..., 3) m of C, corrected; with ``base`` in B.
-
-    Raises:
-        InputError: the scanner is on the flange, so that one pose does not map its points into the base.
-    """
-    corrected = result.correct(points_C)
-    if not base:
-        return corrected
-    if result.configuration != ON_BASE:
-        raise InputError(
-            "This scanner is on the arm: its points lie in the base by X_BF X_FC, with the flange's pose X_BF at the"
-            " scan. Apply without --base, then multiply."
-        )
-    R, p = result.X_BC.rotation().matrix(), result.X_BC.translation()
-    return np.asarray(corrected @ R.T + p)
 
 
 def write_points(path: Path, points: Array) -> None:
@@ -92,7 +78,7 @@ def write_points(path: Path, points: Array) -> None:
         import open3d as o3d  # slow to import
 
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(flat))
-        if not o3d.io.write_point_cloud(str(path), cloud):
+        if not o3d.io.write_point_cloud(path, cloud):
             raise InputError(f"'{path}' cannot be written: check that its folder exists and is writable.")
     else:
         np.savetxt(

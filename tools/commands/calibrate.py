@@ -16,7 +16,7 @@ from weldcal.calibration.calibrate import calibrate as calibrate_observations
 from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_carried, is_motion
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result, software_version
+from weldcal.calibration.data.results import CalibrationResult, IcpRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
@@ -24,19 +24,18 @@ from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
-from weldcal.calibration.eye_on_base.stated_error import orientations_of
+from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import require_joint_angles
-from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.cli.discovery import other_command
+from weldcal.tools.cli.discovery import on_demand, other_command
 from weldcal.tools.cli.options import (
     MOTION,
     Call,
@@ -48,19 +47,18 @@ from weldcal.tools.cli.options import (
     option,
     switch,
 )
-from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import (
+    Algorithm1Outcome,
     CalibrationReport,
     calibration_report,
-    error_summary,
     pose_records,
     tilt_summary,
 )
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import statistics, write_atomic
 
 _CONFIRMING = 3  # hole circles without which the robot's motion alone does not change the scanner
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
@@ -228,7 +226,7 @@ def calibrate_dataset(
         tell("comparing the visible arm", 0.7)
         seen, start = see_with_arm(data, seen, standard, robot or data.header.robot, seed=seed)
     data = seen.data or data
-    observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
+    observations, fits, refused = list(seen.observations), seen.fits, list(seen.refused)
     few = len(observations) < ENOUGH
     confirmed = len(seen.patterns) >= _CONFIRMING
     with examined_where_refused(Path(out), data, seen, standard, seed):
@@ -266,12 +264,12 @@ def calibrate_dataset(
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
+    curve = convergence(inliers, orders=8, seed=seed, solve=solve)
+    algorithm1: Algorithm1Outcome | None = None
+    icp: tuple[IcpRecord, ...] = ()
     if compare:
         tell("Algorithm 1 for comparison", 0.8)
-    algorithm1, verifier, icp = compare_algorithm1(
-        observations, inliers if compare else [], clouds, fits, standard, seed
-    )
-    curve = convergence(inliers, verifier, orders=8, seed=seed, solve=solve)
+        algorithm1, icp = on_demand("compare_algorithm1")(seen, inliers, curve.counts, standard, seed)
     warnings = [*found.warnings, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
@@ -308,7 +306,7 @@ def calibrate_dataset(
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=error_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
+        held_out_mm=statistics(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=tilt_summary(estimate.held_out.tilt_rad[estimate.inliers]),
         poses=pose_records([o.id for o in observations], estimate.inliers, values, refused),
         icp=icp,
@@ -349,7 +347,7 @@ def calibrate_dataset(
         outliers=outliers,
         algorithm1=algorithm1,
         convergence=curve,
-        k_fold_mm=error_summary(1e3 * folds[np.isfinite(folds)]),
+        k_fold_mm=statistics(1e3 * folds[np.isfinite(folds)]),
         seconds=time.monotonic() - started,
         out=Path(out),
         advice=sampling_advice(estimate, corrected),
@@ -395,8 +393,10 @@ def _refinement(
 
 
 def _unconfirmed(inliers: list[Observation], seed: int) -> list[str]:
-    """A sentence where the robot's motion alone asks for a correction of the scanner: many programs could not apply it,
-    and without it X_BC would be off by what it takes over."""
+    """Name the scanner correction that the robot's motion alone asks for, in a sentence.
+
+    Many programs could not apply it, and without it X_BC would be off by what it takes over.
+    """
     asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
     if verdict is None or verdict.accepted is None:
         return []
@@ -418,8 +418,9 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
-    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm
-    confirms.
+    """Require one usable scan.
+
+    Where others were refused: four (then more can be taken), or two that the visible arm confirms.
 
     Raises:
         InputError, TooFewPoses: there are fewer.
@@ -441,9 +442,11 @@ def _enough(observations: list[Observation], refused: list[tuple[str, str]], sta
 def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
-    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as
-    axis_turn_deg; None where fewer than four scans show it. From uncorrected scans, as in a calibration from one
-    scan."""
+    """Estimate the rotation of the hole pattern about the flange axis and its spread over the scans (deg).
+
+    It is for later use as axis_turn_deg; None where fewer than four scans show it. From uncorrected scans, as in a
+    calibration from one scan.
+    """
     seen = [o for o in inliers if o.id in patterns and patterns[o.id].turn_known]
     if len(seen) < ENOUGH:
         return None

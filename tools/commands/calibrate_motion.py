@@ -1,5 +1,4 @@
-"""`weldcal calibrate DATASET` on a recording in motion: estimates X_BC and the scanner's clock, writes exports and a
-report."""
+"""Run `weldcal calibrate` on a recording in motion: X_BC, the scanner's clock, exports and a report."""
 
 import time
 from dataclasses import replace
@@ -65,9 +64,10 @@ def calibrate_motion(
     centres: bool = False,
     limit_mm: float | None = None,
 ) -> MotionReport:
-    """Calibrate from a recording in motion, of a scanner beside the robot that sees the flange or of one on the flange
-    (eye_in_hand) that sees a fixed target of the flange's shape, and write ``calibration.yaml``, exports and
-    ``report.html`` to ``out``.
+    """Calibrate from a recording in motion and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
+
+    The scanner beside the robot sees the flange, or the one on the flange (eye_in_hand) sees a fixed target of the
+    flange's shape.
 
     ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, with the
     capture time). A frame that cannot be used is refused and reported. No scanner correction is estimated: a stream

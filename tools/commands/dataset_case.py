@@ -1,5 +1,4 @@
-"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside
-a result."""
+"""Make the doctor's case of a dataset, the poses as stated and what the scans show, and write it beside a result."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,17 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.doctor.case import NAME, DoctorCase, case_of, case_text
-from weldcal.calibration.doctor.diagnose import FEWEST, diagnose
+from weldcal.calibration.doctor.case import FEWEST, NAME, DoctorCase, case_of, case_text
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.result_files import write_apart
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.report.doctor import worded
-
-_NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "too few scans")
-"""Causes that the solver names itself, or that are none."""
+from weldcal.tools.cli.discovery import on_demand
 
 
 def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> DoctorCase:
@@ -54,8 +49,7 @@ def write_case(folder: Path, case: DoctorCase) -> None:
 def examined_where_refused(
     out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
 ) -> Iterator[None]:
-    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the
-    doctor's first cause.
+    """Write the case to ``out`` where the block refuses five scans or more; the error goes on, with its likely cause.
 
     Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be
     wrong.
@@ -69,20 +63,5 @@ def examined_where_refused(
         if len(seen.observations) >= FEWEST:
             case = dataset_case(data, seen, standard, standard)
             write_case(out, case)
-            _name_cause(problem, case)
+            on_demand("name_cause")(problem, case)
         raise
-
-
-def _name_cause(problem: WeldcalError, case: DoctorCase) -> None:
-    """Adds the doctor's first cause to the sentence, with its evidence and remedy, unless the sentence names it."""
-    causes = worded("", diagnose(case), most=1).causes
-    if not causes or causes[0].name in _NAMED_ALREADY:
-        return
-    cause = causes[0]
-    problem.args = (
-        (
-            f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence}"
-            f" {cause.next}"
-        ),
-        *problem.args[1:],
-    )

@@ -21,7 +21,7 @@ from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch import run_touches
 from weldcal.tools.commands.weld import run_calibration_live, run_scenario
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.run import RunOptions, run_document
 
 
 @command(
@@ -111,15 +111,7 @@ class AnyOutcome:
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` for such a job."""
         run = self.finished.run
-        found: dict[str, object] = {
-            "state": "held" if run.held else "done",
-            "scenario": self.options.scenario,
-            "seed": self.options.seed,
-            "robot": self.finished.robot,
-        }
-        if run.reason:
-            found["reason"] = run.reason
-        return found | run.timing()
+        return run_document(run, self.options, self.finished.robot) | run.timing()
 
 
 def run_any(scenario: Scenario, options: RunOptions, progress: Progress) -> AnyOutcome:

@@ -1,5 +1,4 @@
-"""`weldcal doctor`: names what disturbs a calibration or a weld, with the evidence and the next step, from a result, a
-recording or a dataset."""
+"""Name what disturbs a calibration or a weld, with evidence and next step: `weldcal doctor`."""
 
 import json
 from collections.abc import Sequence
@@ -53,8 +52,7 @@ def doctor(
 
 
 def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: Progress = no_progress) -> DoctorReport:
-    """Name the causes in a result folder (or its calibration.yaml), a recording.mcap or a dataset folder; nothing is
-    written.
+    """Name the causes in a result folder (or calibration.yaml), a recording.mcap or a dataset; write nothing.
 
     Raises:
         InputError: nothing there can be examined.
@@ -158,8 +156,7 @@ def _both(found: Diagnosis, more: tuple[Cause, ...]) -> Diagnosis:
 
 
 def weld_causes(record: WeldRecord | None, reason: str) -> tuple[Cause, ...]:
-    """A hidden tag and a worn tip, from the log; another reason of a hold as it was given ("": the run was not
-    held)."""
+    """Find a hidden tag and a worn tip in the log, or another reason of a hold ("": the run was not held)."""
     causes = []
     blind = 0.0 if record is None else blind_s(record)
     if "Tag hidden" in reason or (not reason and blind > PICTURE_S):

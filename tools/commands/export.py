@@ -94,12 +94,7 @@ class ExportedPose:
         symbol = SYMBOLS.get(self.mounting or "", "The pose")
         found = []
         if self.document.get("scanner_correction") is not None:
-            readable = symbol == "X_BC" and self.file.name == RESULT_FILE
-            found.append(
-                correction_hint(symbol, self.file)
-                if readable
-                else f"{symbol} applies to corrected scanner points: see scanner_correction in {self.file.name}."
-            )
+            found.append(correction_hint(symbol, self.file))
         if self.document.get("kinematics_file"):
             found.append(f"{symbol} belongs to the arm with the kinematics of {self.document['kinematics_file']}.")
         return tuple(found)

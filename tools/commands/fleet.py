@@ -56,8 +56,7 @@ def fleet(
 
 
 def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: int = 0) -> FleetReport:
-    """Calibrate every dataset and verify each cell's first calibration on its later datasets; write report.html and
-    fleet.json.
+    """Calibrate every dataset, verify each cell's first calibration on its later ones; write report.html, fleet.json.
 
     A folder with dataset.yaml is a dataset. Datasets in one folder below ``folder`` are of one cell, the oldest first
     by name; a dataset directly in ``folder`` is a cell by itself. A second run with the same output folder does only
@@ -101,8 +100,9 @@ def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: 
 
 
 def find_cells(folder: Path) -> dict[str, dict[str, Path]]:
-    """Datasets by cell and name, sorted: a cell is the folder that holds its datasets, or a dataset directly in
-    ``folder``.
+    """Sort datasets by cell and name.
+
+    A cell is the folder that holds its datasets, or a dataset directly in ``folder``.
 
     Raises:
         InputError: there is none, or ``folder`` is one dataset itself.

@@ -220,8 +220,9 @@ def run_hand_eye(
     intrinsics: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
-    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html
-    besides the exports.
+    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved.
+
+    Writes report.html besides the exports.
 
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the
     scanner, for the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and

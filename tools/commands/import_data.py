@@ -1,5 +1,4 @@
-"""`weldcal import SOURCE... --out FOLDER`: writes poses, pairs or scans of any form as a dataset in weldcal's own
-form."""
+"""Write poses, pairs or scans of any form as a dataset in weldcal's own form: `weldcal import`."""
 
 import os
 import shutil
@@ -45,8 +44,7 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True)
 class Imported:
-    """What was written and understood: `kind` (pairs or scans), `count`, the four lines, the files, and how each list
-    was read."""
+    """What was written: `kind` (pairs or scans), `count`, the four lines, the files, how each list was read."""
 
     kind: str
     count: int
@@ -149,8 +147,10 @@ def import_pose_pairs(
 
 
 def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: StatedForms) -> tuple[PosePairs, bool]:
-    """The pairs, and whether their mounting is known; without one the reading must be the same in both mountings that
-    agree."""
+    """Read the pairs, and whether their mounting is known.
+
+    Without one the reading must be the same in both mountings that agree.
+    """
 
     def read(mode: str | None) -> PosePairs:
         if len(sources) == 1:
@@ -195,8 +195,7 @@ def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: S
 
 
 def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting: str | None = None) -> Imported:
-    """Write scans of a flange with their poses as dataset.yaml, poses.csv and clouds/ (linked where possible, else
-    copied).
+    """Write scans of a flange with their poses as dataset.yaml, poses.csv and clouds/ (linked, else copied).
 
     Raises:
         InputError: they cannot be read; with poses in several possible readings, the flange is not known.

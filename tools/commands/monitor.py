@@ -1,5 +1,4 @@
-"""`weldcal monitor FOLDER --calibration RESULT`: tracks the flange through a recording in motion and tests for
-drift."""
+"""Track the flange through a recording in motion and test for drift: `weldcal monitor`."""
 
 import json
 import time
@@ -147,8 +146,7 @@ def monitor_recording(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> MonitorReport:
-    """Watch a calibration (its folder or calibration.yaml) over a recording in motion; write report.html and
-    monitor.json.
+    """Watch a calibration (its folder or file) over a recording in motion; write report.html and monitor.json.
 
     The clock's offset is estimated from the recording itself; the calibration's is used where the recording does not
     show it. ``flange`` overrides dataset.yaml. ``body`` is a link that is tracked instead of the flange, by its mesh
@@ -229,8 +227,7 @@ def rate_checked(false_alarms_per_hour: float) -> None:
 def recalibrated_result(
     result: CalibrationResult, watched: DriftHistory, hashes: dict[str, str], flange: str, seed: int
 ) -> CalibrationResult:
-    """The calibration as it is at the end of a watch, from all frames since the last change and the calibration before
-    it."""
+    """Calibrate at the end of a watch, from all frames since the last change and the calibration before it."""
     held = 1e3 * np.linalg.norm(watched.after[~watched.gross & (watched.rows.times >= watched.since_s)], axis=1)
     errors = {"median": float(np.median(held)), "mean": float(held.mean()), "p95": float(np.percentile(held, 95.0))}
     return replace(
@@ -398,8 +395,7 @@ def monitor_live(
     recalibrate: bool = False,
     record: bool = False,
 ) -> LiveMonitor:
-    """Watch a calibration while the arm moves through the scenario's cube; write report.html, monitor.json and the 3D
-    recording.
+    """Watch a calibration while the arm moves in the scenario's cube; write report.html, monitor.json and recordings.
 
     The DriftMonitor in the cell tests every frame as it comes. At the end all frames are tested again with the clock
     that they show together, as on a recording. ``record`` also writes what streamed as a recording, by whose still

@@ -1,5 +1,4 @@
-"""Watches a link of the arm instead of its flange: by the mesh of its description, or by a model fused from the
-scans."""
+"""Watch a link of the arm instead of its flange: by its description's mesh, or by a model fused from the scans."""
 
 from collections.abc import Callable
 from dataclasses import replace

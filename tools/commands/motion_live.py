@@ -1,5 +1,4 @@
-"""Runs the motion job: calibrates a streaming scanner and its clock live, writes the result, and compares it with the
-truth."""
+"""Run the motion job: calibrate a streaming scanner and its clock live, and compare with the truth."""
 
 import json
 from dataclasses import dataclass
@@ -17,10 +16,9 @@ from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_result, motion_screen
-from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.render import render, statistics, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
 
@@ -44,8 +42,7 @@ class MotionOutcome:
         return self.options.out
 
     def true_captures(self) -> dict[int, float]:
-        """True capture times (s) of the frames by number, on the clock of the robot's stream; empty where no simulation
-        knows them.
+        """List true capture times (s) by frame number, on the stream's clock; empty where no simulation knows them.
 
         A drawn arm that follows an emulated controller is behind it: a frame then shows where that arm was before.
         """
@@ -134,7 +131,7 @@ class MotionOutcome:
                 "clock": c.kind,
                 "clock_offset_ms": None if c.offset_s is None else 1e3 * c.offset_s,
                 "clock_offset_sigma_ms": None if c.sigma_s is None else 1e3 * c.sigma_s,
-                "held_out_mm": error_summary(1e3 * e.held_out_m[e.inliers]),
+                "held_out_mm": statistics(1e3 * e.held_out_m[e.inliers]),
                 "rms_mm": 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2))),
                 "truth": self.truth(),
             }
@@ -146,8 +143,7 @@ def _ms(values: tuple[float, ...], percentile: float) -> float | None:
 
 
 def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
-    """How long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says, from all joints in
-    motion."""
+    """Estimate how long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says."""
     stream = record.stream("")
     assert stream.joints is not None
     inside = (t > stream.time[0]) & (t < stream.time[-1])
@@ -157,8 +153,10 @@ def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
 
 
 def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:
-    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings. Raises as
-    run_job."""
+    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings.
+
+    Raises as run_job.
+    """
     job = scenario.part(MotionJob)
     if job is not None and job.record:
         job.recording_folder = str(options.out / "recording")

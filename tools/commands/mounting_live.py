@@ -107,8 +107,10 @@ def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progres
 
 
 def write_mounting(report: MountingReport, finished: JobRun | None = None) -> None:
-    """Write hand_eye.yaml with its exports, sightings.csv, summary.txt and report.html; of a live run also
-    scenario.yaml, scans/ (a dataset for `weldcal calibrate`), station.png and recording.html."""
+    """Write hand_eye.yaml with its exports, sightings.csv, summary.txt and report.html.
+
+    Of a live run also scenario.yaml, scans/ (a dataset for `weldcal calibrate`), station.png and recording.html.
+    """
     folder, picture = report.folder, None
     source, text = "dataset.yaml", ""
     if report.run is not None:
@@ -169,8 +171,7 @@ def calibrate_carried(
     limit_mm: float | None = None,
     progress: Progress = no_progress,
 ) -> RecordedMounting:
-    """Calibrate a scanner that an arm carries from a dataset with scans at rest, as the live job does, and write the
-    result to ``out``.
+    """Calibrate a scanner that an arm carries from scans at rest, as the live job does; write the result to ``out``.
 
     ``robot``, ``flange`` override dataset.yaml; ``poses``, ``limit_mm``: see calibrate_dataset.
 
@@ -325,8 +326,10 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
 
 
 def recorded_joints(data: Dataset, scene: MountingScene) -> dict[str, tuple[Array, Array | None]]:
-    """Joint angles of both arms by id: they lead the arm as drawn to the stated poses. Raises InputError where that is
-    not possible."""
+    """Joint angles of both arms by id: they lead the arm as drawn to the stated poses.
+
+    Raises InputError where that is not possible.
+    """
     given, second, found = data.joints(), data.joints(SECOND_JOINTS) if scene.two else {}, {}
     on_arm = scene.link not in (BASE, FLANGE)
     if (on_arm and not given) or (scene.two and not second):
@@ -361,8 +364,7 @@ def _pose(X: RigidTransform) -> tuple[list[float], list[float]]:
 
 
 def _observations(report: MountingReport) -> str:
-    """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share
-    of the edge."""
+    """List the rows of sightings.csv: joints (deg), centre (mm), normal in the camera frame, visible edge share."""
     two = report.scene.two
     joints = [f"q{i}_deg" for i in range(1, 7)] + ([f"second_q{i}_deg" for i in range(1, 7)] if two else [])
     columns = ["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"]

@@ -64,8 +64,7 @@ class Mutation:
 
 
 def read_mutations(text: str) -> tuple[Mutation, ...]:
-    """The mutations of a list: "file: tests" at the margin, then for each an indented reason, "- text", "+
-    replacement".
+    """Read a list: "file: tests" at the margin, then indented reason, "- text" and "+ replacement" of each.
 
     Raises:
         InputError: a line has another form.

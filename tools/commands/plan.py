@@ -87,8 +87,11 @@ def _line(p: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A motion and what it is expected to tell, one sigma; infinite where it shows nothing. ``cost_mm`` is the error of
-    a point on a part in motion. ``corners_deg`` are the joint angles of a cube's corners, empty for a stream."""
+    """A motion and what it is expected to tell, one sigma; infinite where it shows nothing.
+
+    ``cost_mm`` is the error of a point on a part in motion. ``corners_deg`` are the joint angles of a cube's
+    corners, empty for a stream.
+    """
 
     name: str
     error_mm: float
@@ -195,8 +198,7 @@ def plan_refining_poses(
     seed: int = 0,
     progress: Progress = lambda stage, fraction: None,
 ) -> dict[str, object]:
-    """Choose ``scans`` poses of a scenario's arm before its scanner (at its guess); write poses.csv, poses.script and
-    plan.json to ``out``.
+    """Choose ``scans`` poses before a scenario's scanner; write poses.csv, poses.script and plan.json to ``out``.
 
     poses.csv is the table of a dataset with the joint angles as planned; replace them by those that the robot reports
     at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in

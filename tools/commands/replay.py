@@ -63,8 +63,7 @@ def replay(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """A finished replay: seconds of the recording that were replayed, how many values were compared, and what differs
-    by port.
+    """A finished replay: seconds replayed, number of values compared, and what differs by port.
 
     X_BC (4,4): the calibration that the replay has found, or None. cut_off: the file ends before its run.
     """

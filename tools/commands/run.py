@@ -1,5 +1,4 @@
-"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer, records and
-advances it."""
+"""Run the job of a scenario for all commands: robot, cell, viewer, recording and the loop."""
 
 import dataclasses as dc
 import json
@@ -87,8 +86,7 @@ def named_once(name: str | None, scenario: str, preset: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """A completed run, done or held; its recording viewer, or None; the name of its robot; what was shown of it, or
-    None."""
+    """A completed run, done or held; its recording viewer or None; its robot's name; what was shown or None."""
 
     run: Run[Any]
     meshcat: Meshcat | None
@@ -96,8 +94,7 @@ class JobRun:
     live: LiveView | None = None
 
     def share(self, done: float) -> float:
-        """The completed share while results are written: ``done`` of a completed run; a held one keeps what it had
-        reached."""
+        """Return the completed share while results are written: ``done`` if completed, else what it had reached."""
         return self.run.share if self.run.held else done
 
     @property
@@ -157,7 +154,14 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
             told("build the cell", 0.0)
             live = None if meshcat is None else LiveView() if source is None else source.live
             cell = build_cell(
-                scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, operator=operator, live=live
+                scenario,
+                options.seed,
+                meshcat,
+                robot.prepared,
+                open_sink=open_sink,
+                operator=operator,
+                live=live,
+                replace=options.replace,
             )
             with closing(cell.station):
                 if meshcat is not None:
@@ -192,8 +196,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _dashboard(operator: Operator, meshcat: Meshcat | None, options: RunOptions) -> Iterator[DashboardSource | None]:
-    """Serve the run's page for the duration of the block, and open it in the browser; None where no viewer is
-    wanted."""
+    """Serve the run's page during the block and open it in the browser; None where no viewer is wanted."""
     if meshcat is None or not options.browser:
         yield None
         return
@@ -217,8 +220,7 @@ def _dashboard(operator: Operator, meshcat: Meshcat | None, options: RunOptions)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
-    """Set the background and the viewer's camera; everything is drawn in B, and shown as the base stands in the
-    world."""
+    """Set background and camera of the viewer; all is drawn in B, and shown as the base is in the world."""
     if not X_WB.IsExactlyIdentity():
         meshcat.SetTransform("/drake", X_WB)
         camera, target = camera + X_WB.translation(), X_WB @ target

@@ -25,8 +25,7 @@ TABLE = "touches.csv"
 
 
 def verify_touches(result: Path, touches: Path, out: Path) -> TouchReport:
-    """Judge a calibration (its folder or calibration.yaml) by a table of touches; write report.html, touch_errors.csv
-    and touch.json to ``out``.
+    """Judge a calibration by a table of touches; write report.html, touch_errors.csv and touch.json to ``out``.
 
     Raises:
         InputError: the result, the table or the output folder cannot be used; nothing is written.

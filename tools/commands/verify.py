@@ -17,7 +17,7 @@ from weldcal.calibration.eye_on_base.observations import corrected_observation, 
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.hand_eye.solve import as_transform
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
@@ -207,8 +207,9 @@ def verify_dataset(
     limit_mm: float | None = None,
     pose: str | None = None,
 ) -> VerifyReport:
-    """Verify a calibration (its folder or calibration.yaml, or any file with a pose) on a dataset folder; write
-    verification.json and report.html.
+    """Verify a calibration on a dataset folder; write verification.json and report.html.
+
+    The calibration is its folder or calibration.yaml, or any file with a pose.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
     is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
@@ -238,9 +239,13 @@ def verify_dataset(
         tell=lambda fraction: tell("fitting flanges", 0.9 * fraction),
     )
     data = seen.data or data
+    differences = _differences(calibrations[0], data, standard.designation)
+    other_arm = f"{differences[0]} " if differences and data.header.robot not in ("", calibrations[0].robot) else ""
     if not seen.observations:
         first, reason = seen.refused[0]
-        raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")
+        raise InputError(
+            f"{other_arm}None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}"
+        )
     calibration = min(calibrations, key=lambda one: float(np.median(position_errors(one.X_BC, seen.observations))))
     arm_used, moved, shared = _with_kinematics(Path(result), calibration, data, seen.observations, correction)
     seen = replace(seen, observations=moved)
@@ -253,7 +258,6 @@ def verify_dataset(
     poses = _judge(calibration, data, observations)
     uncorrected: tuple[str, ...] = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
     uncorrected += arm_used
-    differences = _differences(calibration, data, standard.designation)
     gross = _gross(calibration, poses)
     new = [k for k, p in enumerate(poses) if not p.used_before]
     if limit_mm is None:
@@ -265,11 +269,13 @@ def verify_dataset(
         source = "as given with --limit-mm"
     diagnostics = [*differences, *gross, *uncorrected, *_alike(data, observations)]
     verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
+    if other_arm.strip() not in verdict.reason:
+        verdict = replace(verdict, reason=f"{other_arm}{verdict.reason}")
     warnings = (
+        *differences,
         *read_as,
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
-        *differences,
         *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(
@@ -295,8 +301,7 @@ def verify_dataset(
 
 
 def _calibrations(path: Path, pose: str | None) -> tuple[list[CalibrationResult], tuple[str, ...]]:
-    """What `calibrate` wrote; or the camera's pose in another file in every reading that its numbers allow, and a
-    sentence that names it."""
+    """Read what `calibrate` wrote, or a camera's pose in every reading that its numbers allow, with a sentence."""
     try:
         return [load_result(path)], ()
     except InputError:
@@ -326,8 +331,10 @@ def _with_kinematics(
     observations: tuple[Observation, ...],
     correction: ScannerCorrection | None,
 ) -> tuple[tuple[str, ...], tuple[Observation, ...], tuple[Array, Array] | None]:
-    """The observations with the poses that the arm of the result's kinematics file reaches, and what it states of their
-    errors (see shared_error), or a sentence where the scans have no joint angles."""
+    """Move the observations to the poses that the arm of the result's kinematics file reaches.
+
+    With what it states of their errors (see shared_error), or a sentence where the scans have no joint angles.
+    """
     if not result.kinematics_file:
         return (), observations, None
     q = joint_angles(data, [o.id for o in observations], 6)
@@ -478,8 +485,7 @@ def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...
 
 
 def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
-    """Change of scale that best explains the errors together with a shift, and its standard error; NaN for few
-    scans."""
+    """Estimate the scale that, with a shift, best explains the errors, and its standard error; NaN for few scans."""
     n = len(observations)
     if n < 6:
         return float("nan"), float("nan")

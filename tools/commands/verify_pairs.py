@@ -1,5 +1,4 @@
-"""`weldcal verify RESULT PAIRS`: judges any file with a camera's pose on pairs of robot and camera poses, or on
-pictures of a board."""
+"""Judge any file with a camera's pose on pairs of robot and camera poses, or on pictures of a board."""
 
 import json
 from collections.abc import Callable
@@ -30,8 +29,7 @@ _MOUNTINGS = ("eye_in_hand", "eye_on_base")
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether a file or folder holds scans of a flange, and not pairs of poses: clouds, pairs.csv of centres, or a ROS
-    recording."""
+    """Find whether a path holds scans of a flange, not pairs of poses: clouds, pairs.csv of centres, a recording."""
     if path.is_file():
         return find_bag(path) is not None
     if not path.is_dir():
@@ -129,8 +127,7 @@ def _judged(
     read_in: Callable[[str | None], tuple[PosePairs, HandEyeResult | None]],
     config: HandEyeConfig,
 ) -> tuple[PosePairs, int, Judgement]:
-    """The pairs, the reading of the pose and its judgement, in the stated mounting or else in the one in which the pose
-    fits."""
+    """Judge the pose on the pairs, in the stated mounting or else in the one in which it fits."""
 
     def judged(mode: str | None) -> tuple[PosePairs, int, Judgement]:
         pairs, new = read_in(mode)

@@ -12,8 +12,7 @@ from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
-from weldcal.calibration.eye_on_base.stated_error import orientations_of
-from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.models.result_files import whole_result
 from weldcal.systems.cell import Cell
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
@@ -117,8 +116,7 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, fit_up.csv, plots/, recording.html,
-    summary.json, report.html."""
+    """Write all files of a weld: the calibration and its exports, scans, logs, plots, recording and report."""
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -233,8 +231,7 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
 
 
 def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
-    """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate
-    by it."""
+    """Make the doctor's case of a live calibration; None where the job does not calibrate by a feature."""
     status = getattr(cell.job, "calibration_status", None)
     seen = None if status is None else status(root)
     if seen is None or not seen.observations:

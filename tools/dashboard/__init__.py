@@ -1,2 +1,1 @@
-"""The dashboard: one page on this computer that shows a running cell, with buttons to hold it, let it go on, or end
-it."""
+"""Show a running cell on one page of this computer, with buttons to hold it, go on, or end it."""

@@ -42,8 +42,7 @@ _SCAN_S, _MOVES_S, _TOUCH_S, _WHOLE_SEAM_MM = 3.0, {"Park": 3.0, "Approach": 5.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Facts:
-    """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job
-    has none.
+    """Facts of a run: name and phases of each step (`steps`); lengths in mm, NaN or None where the job has none.
 
     `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected
     error after the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen.
@@ -146,8 +145,7 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
 
 
 def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:
-    """A function that computes the expected error m at the work point after one more planned pose; NaN where it
-    cannot."""
+    """Make a function of the expected error m at the work point after one more planned pose; NaN: unknown."""
     x, y, z = (float(v) for v in work_point(job.scenario))
     config = PlannerConfig(work_point_B=(x, y, z))
 

@@ -35,8 +35,7 @@ _PAGE = Path(__file__).parent / "page"
 
 @dataclass(frozen=True)
 class PageSetup:
-    """What the process is started with: its listening socket; the key of its buttons or None; the token of its address
-    or None."""
+    """What the process starts with: listening socket, key of the buttons or None, token of the address or None."""
 
     listener: socket.socket
     view_url: str | None

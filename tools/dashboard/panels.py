@@ -1,5 +1,4 @@
-"""What the dashboard shows of the jobs besides the weld: steps, live plots and lines of text, from the job's newest
-messages."""
+"""Show the jobs besides the weld: steps, live plots and lines of text, from the job's newest messages."""
 
 from __future__ import annotations
 

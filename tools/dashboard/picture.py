@@ -1,5 +1,4 @@
-"""The newest scan as a small depth picture, with the flange that was found in it; or the wrist camera's newest
-picture."""
+"""Draw the newest scan as a small depth picture with its flange, or the wrist camera's newest picture."""
 
 from __future__ import annotations
 
@@ -74,8 +73,7 @@ def _ring(center: Array, normal: Array, radius_m: float) -> Array:
 
 
 def _pixels_of(points: Array, ring: Array) -> Array | None:
-    """Pixels (n, 2) of points in the organised cloud's own projection, u = a x / z + b, fitted to it; None without
-    enough points."""
+    """Map points to pixels (n, 2) by the organised cloud's own projection u = a x / z + b; None for few points."""
     v, u = np.nonzero(np.isfinite(points[:, :, 2]))
     if len(u) < 50:
         return None

@@ -1,5 +1,4 @@
-"""recording.html: the 3D view's page with an overlay: phase, figures, legend, and cameras that follow the run until one
-is moved."""
+"""Write recording.html: the 3D page with phase, figures, legend, and cameras that follow until one is moved."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The dashboard's pages, each served by a process of its own: on loopback, and read-only for the network behind a
-token."""
+"""Serve the dashboard's pages, each by a process: on loopback, and read-only for the network behind a token."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""DashboardSource: what the page is told of a run, and what its buttons ask of the operator's wishes; used by the
-server's threads."""
+"""Pass a run's state to its page, and the buttons' wishes to the run; used by the server's threads."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ class DashboardSource:
         self._ended = (HELD if held and not self.operator.ends else ENDED if held else DONE, reason)
 
     def conclude(self, first: FirstScreen | None, folder: Path | None) -> None:
-        """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is
-        none."""
+        """Take the result: the first screen, and the folder of report.html and recording.html (None: none)."""
         if folder is not None:
             self.files = {name: folder / name for name in PAGES if (folder / name).exists()}
         rows = {} if first is None else {n.strip(): t for n, t in first.rows().items() if n.strip() not in LEFT_OUT}
@@ -86,8 +84,7 @@ class DashboardSource:
         return self._ended is not None
 
     def act(self, what: str, value: float | None = None) -> bool:
-        """Do what a button asks: "hold", "go_on", "end", "pace" or "camera-NAME"; False where there is no such button
-        now."""
+        """Do what a button asks: "hold", "go_on", "end", "pace", "camera-NAME"; False where there is no such button."""
         operator = self.operator
         if self.ended:
             return False

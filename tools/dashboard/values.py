@@ -1,5 +1,4 @@
-"""Puts what the page shows into words and numbers of JSON: the state in large letters, steps, plots, last and next
-scan."""
+"""Write what the page shows as words and numbers of JSON: state, steps, plots, last and next scan."""
 
 from __future__ import annotations
 

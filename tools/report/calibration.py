@@ -23,7 +23,7 @@ from weldcal.calibration.data.results import (
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence, bootstrap_interval, mean_interval
+from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -57,26 +57,12 @@ from weldcal.tools.report.pictures import (
     subplots,
     svg,
 )
-from weldcal.tools.report.render import fixed, known, render, sigma_rows
-
-
-def error_summary(values: Array) -> dict[str, float]:
-    """Median, mean, 95th percentile and maximum of the finite values (n,), in their unit; NaN where there are none."""
-    v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
-    if len(v) == 0:
-        return dict.fromkeys(("median", "mean", "p95", "max"), float("nan"))
-    return {
-        "median": float(np.median(v)),
-        "mean": float(v.mean()),
-        "p95": float(np.percentile(v, 95)),
-        "max": float(v.max()),
-    }
+from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
 
 
 def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
     """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
-    s = error_summary(np.degrees(tilts_rad))
+    s = statistics(np.degrees(tilts_rad))
     return {k: known(s[k]) for k in ("median", "p95")}
 
 
@@ -94,11 +80,11 @@ def pose_records(
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive
-    to.
+    """Algorithm 1 on the same data: its figure, its errors at unused poses, and what the figure does not show.
 
     ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at
     the flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
+    ``curve``: what it reports (orders, k) and its true errors (rows, k), m, at the counts of the report's convergence.
     """
 
     verification: str
@@ -108,7 +94,7 @@ class Algorithm1Outcome:
     at_verification_mm: float
     unseen: tuple[str, ...]
     shares: tuple[float, ...]
-    run: Algorithm1Run
+    curve: tuple[Array, Array]
 
     @property
     def sentence(self) -> str:
@@ -219,8 +205,7 @@ class CalibrationReport:
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
-        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four
-        errors."""
+        """Interval (mm) of the mean error of as many new scans, with 95 % probability; None for fewer than four."""
         return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     def summary(self) -> dict[str, Any]:
@@ -284,8 +269,10 @@ def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
 def feature_residuals(
     fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]
 ) -> list[dict[str, float | int | str | None]]:
-    """One row per scan: rms residual (mm) of plane, outer edge, bore (None where not seen) and of the hole centres from
-    their pattern (None where fewer than four show), and one sigma (deg) of the rotation about the flange's axis."""
+    """List rms residuals (mm) of plane, outer edge, bore and holes, and the sigma (deg) of the turn, a row a scan.
+
+    The bore is None where not seen, the holes (from their pattern) where fewer than four show.
+    """
     rows: list[dict[str, float | int | str | None]] = []
     for id, fit in fits.items():
         holes = patterns.get(id)
@@ -420,8 +407,10 @@ def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
     figure, axes = subplots(8.2, 3.9)
     _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on unused scans")
-    _band(axes, c.counts, 1e3 * c.figure_true, TRUTH, "Algorithm 1, on unused scans")
-    _band(axes, c.counts, 1e3 * c.figure, THEIRS, "figure reported by Algorithm 1")
+    if report.algorithm1 is not None:
+        figure_m, true_m = report.algorithm1.curve
+        _band(axes, c.counts, 1e3 * true_m, TRUTH, "Algorithm 1, on unused scans")
+        _band(axes, c.counts, 1e3 * figure_m, THEIRS, "figure reported by Algorithm 1")
     axes.set(xlabel="number of scans", ylabel="error at the flange, mm")
     axes.set_ylim(bottom=0.0)
     if axes.lines:
@@ -447,8 +436,7 @@ _SHADES = LinearSegmentedColormap.from_list("known", ["#eef4f8", "#9dc0d8", "#1d
 
 
 def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
-    """Standard deviation (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and from the
-    side."""
+    """Draw the sigma (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and aside."""
     middle, extent = p_B.mean(axis=0), float(np.ptp(p_B, axis=0).max())
     weak, least = weakest_place(estimate, p_B), 1e3 * sigma_at(estimate, middle)
     figure = Figure(figsize=(8.2, 4.0), layout="constrained")
@@ -465,24 +453,12 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
                 p[i], p[j] = a, b
                 sigma[row, column] = 1e3 * sigma_at(estimate, p)
         drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
-        axes.plot(
-            1e3 * p_B[:, i],
-            1e3 * p_B[:, j],
-            "o",
-            color="white",
-            markeredgecolor="#222",
-            markersize=5,
-            label="poses taken",
-        )
-        axes.plot(
-            1e3 * weak[i],
-            1e3 * weak[j],
-            "*",
-            color="#e0872f",
-            markeredgecolor="#222",
-            markersize=15,
-            label="best next pose",
-        )
+        for at, mark, size, colour, label in (
+            (p_B, "o", 5, "white", "poses taken"),
+            (weak[None], "*", 15, "#e0872f", "best next pose"),
+        ):
+            x, y = 1e3 * at[:, i], 1e3 * at[:, j]
+            axes.plot(x, y, mark, color=colour, markeredgecolor="#222", markersize=size, label=label)
         axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")

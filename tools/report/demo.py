@@ -16,7 +16,6 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.tools.report import plots_weld
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import (
     SCANNER,
     ExpectedError,
@@ -34,8 +33,8 @@ from weldcal.tools.report.first_screen import (
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.plots_weld import WeldTrace
-from weldcal.tools.report.render import fixed, render, sigma_rows
-from weldcal.tools.report.run import RunOptions, robot_timing
+from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
+from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import (
     CalibrationError,
     WeldOutcome,
@@ -95,8 +94,7 @@ class DemoResult:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was
-        welded."""
+        """The first screen: of the calibration, by the job's required error; of a weld alone, whether it was welded."""
         scenario, status = self.run.cell.scenario, self.status
         estimate, c = status.estimate, self.run.cell.scenario.calibration
         against = [self.run.reason or "The job was held."] if self.state == "held" else []
@@ -201,10 +199,7 @@ class DemoResult:
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
-        found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
-        found["robot"] = self.robot
-        if self.run.reason:
-            found["reason"] = self.run.reason
+        found = run_document(self.run, self.options, self.robot)
         if self.warnings:
             found["warnings"] = list(self.warnings)
         if (watched := self.run.cell.job.drift(self.run.root)) is not None:
@@ -296,7 +291,7 @@ def seam_document(error: PathError) -> dict[str, float]:
 
 def live_errors(values: np.ndarray) -> dict[str, float]:
     """Median, mean and 95th percentile of the finite values, in their unit; empty where there are none."""
-    found = error_summary(values)
+    found = statistics(values)
     return {name: found[name] for name in ("median", "mean", "p95") if np.isfinite(found[name])}
 
 
@@ -432,8 +427,7 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:
-    """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig.
-    11)."""
+    """Draw the errors of the estimate in use and Algorithm 1's own figure against the scans taken (Fig. 11)."""
     n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
     picture, axes = subplots(7.2, 3.4)
     axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")

@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis
+from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
+from weldcal.models.errors import WeldcalError
 
 CALIBRATION = "calibration.yaml"
 CHECKED = (
@@ -13,7 +15,7 @@ CHECKED = (
     "poses too alike",
     "scanner out of focus or range", "warm-up drift", "slack flange or loose mount", "wrong kinematics file",
     "outlier scans or partial views", "hidden tag", "soft tip worn", "scanner axes mirrored",
-    "scans and poses in different orders", "scanner scale error", "too few scans",
+    "scans and poses in different orders", "scanner scale error", "too few scans", "position columns exchanged",
 )  # fmt: skip
 
 
@@ -33,8 +35,7 @@ _CENTRES_SAY = 1.5
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """The named causes, the likeliest first; what was examined, its number of scans and the spread that remains (mm,
-    None: unknown)."""
+    """The named causes, the likeliest first; what was examined, number of scans, and the spread left (mm or None)."""
 
     source: str
     causes: tuple[NamedCause, ...]
@@ -79,6 +80,25 @@ def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
         tuple(NamedCause(c.name, round(c.confidence, 3), *_WORDS[c.name](c)) for c in diagnosis.causes[:most]),
         diagnosis.n,
         spread if spread == spread else None,
+    )
+
+
+_NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "too few scans")
+"""Causes that the solver names itself, or that are none."""
+
+
+def name_cause(problem: WeldcalError, case: DoctorCase) -> None:
+    """Add the likely cause, its evidence and its remedy to the sentence of a refusal, unless the sentence names it."""
+    causes = worded("", diagnose(case), most=1).causes
+    if not causes or causes[0].name in _NAMED_ALREADY:
+        return
+    cause = causes[0]
+    problem.args = (
+        (
+            f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence}"
+            f" {cause.next}"
+        ),
+        *problem.args[1:],
     )
 
 
@@ -128,6 +148,7 @@ def _misread(c: Cause) -> tuple[str, str]:
         "wrong quaternion order": f"Swap the columns, or set 'poses: {{rotation: {order}}}' in dataset.yaml.",
         "poses inverted": "Set 'poses: {frame: base_in_flange}' in dataset.yaml, or invert the poses.",
         "wrong rotation convention": "Set 'poses: {rotation: ...}' in dataset.yaml to what the robot writes.",
+        "position columns exchanged": "Name the columns in the header of the poses in the order of their numbers.",
         "scanner axes mirrored": "Export the clouds in a right-handed frame: x right, y down, z out of the scanner.",
         "scans and poses in different orders": (
             "Pair each scan with its own pose, by the same name; write numbers as 01, 02."
@@ -335,5 +356,5 @@ _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
     "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn,
     "the run was held": _held,
     "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
-    "too few scans": _few, "unexplained": _unexplained,
+    "too few scans": _few, "unexplained": _unexplained, "position columns exchanged": _misread,
 }  # fmt: skip

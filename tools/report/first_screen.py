@@ -1,5 +1,4 @@
-"""The first screen of every report and of the terminal: verdict, expected error, what could be wrong, next step and
-poses.
+"""Make the first screen of reports and terminal: verdict, error, concerns, next step and poses.
 
 It holds the rule of the verdict, every printed form of a pose, and the error of a scanned point at the work point.
 """
@@ -47,9 +46,10 @@ def pose_rows(pose: object, symbol: str = "X_BC", words: str = "") -> dict[str, 
 
 @dataclass(frozen=True)
 class WorkPoint:
-    """The expected error of a scanned point at ``p_B_mm`` in the base: with 95 % probability at most ``error_95_mm``,
-    if the errors are as stated; ``unseen_poses`` with a held-out error back it, 95 % of which were within
-    ``held_out_95_mm`` (None: too few).
+    """The expected error of a scanned point at ``p_B_mm`` in the base.
+
+    With 95 % probability it is at most ``error_95_mm``, if the errors are as stated; ``unseen_poses`` with a
+    held-out error back it, 95 % of which were within ``held_out_95_mm`` (None: too few).
     """
 
     p_B_mm: tuple[float, float, float]
@@ -142,8 +142,7 @@ class Next:
 
 @dataclass(frozen=True, eq=False)
 class ShownPose:
-    """A pose that a command computed: its symbol (X_BC), frames in words, and the transform with its translation in
-    m."""
+    """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m."""
 
     symbol: str
     words: str
@@ -269,8 +268,7 @@ class FirstScreen:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """At most three things that a reader should know and that do not speak against the result; the third says how
-        many more there are."""
+        """List at most three things that do not speak against the result; the third counts the others."""
         return _first_few(text for text in self.found.notes if text not in self.concerns)
 
     @property
@@ -332,8 +330,9 @@ def after_hold(
 
 
 def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
-    """Covariance (3, 3) m^2 of a point at ``p`` (3,) m of the parent's axes, mapped by ``X`` with covariance (6, 6)
-    [rotation; translation].
+    """Map the covariance (6, 6) [rotation; translation] of ``X`` to (3, 3) m^2 of a point.
+
+    ``p`` (3,) m is the point in the parent's axes.
 
     The rotation is on the parent's side about the child's origin, as in every result of weldcal.
     """
@@ -346,8 +345,7 @@ def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
 def expected_error(
     what: str, own_mm: float | None, held_95_mm: float | None, n: int, of: str, place: str = ""
 ) -> tuple[ExpectedError, float]:
-    """The error at 95 % in words, and in mm (NaN: not known): the larger of the result's own and that of what it had
-    not seen.
+    """Return the error at 95 % in words and mm (NaN: unknown): the larger of the own and the unseen one.
 
     ``own_mm``: from the covariance (None: none is stated), ``place``: where; ``held_95_mm``: 95 % of ``n`` held-out
     errors of ``of`` (poses, scans; None: there are none).

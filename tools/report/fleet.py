@@ -33,8 +33,7 @@ class Checked:
 
     @property
     def error_mm(self) -> float | None:
-        """Median error of the cell's first calibration on this dataset, mm: held-out for its own dataset, else
-        verified."""
+        """Median error of the cell's first calibration here, mm: held-out for its own dataset, else verified."""
         if self.verification is None:
             return None if self.calibration["state"] == "failed" else self.calibration["held_out_mm"]["median"]
         return None if self.verification["state"] == "failed" else self.verification["position_error_mm"]["median"]
@@ -47,8 +46,7 @@ class Checked:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetCell:
-    """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what
-    to do."""
+    """A cell with its datasets, oldest first, and the verdict: VISIT, LOOK or FINE, why, and what to do."""
 
     name: str
     datasets: tuple[Checked, ...]

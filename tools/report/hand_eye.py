@@ -1,5 +1,4 @@
-"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of
-methods."""
+"""Write the page of `weldcal hand-eye`: poses with sigma, errors of every sample, comparison of methods."""
 
 from base64 import b64encode
 from collections.abc import Mapping
@@ -33,8 +32,10 @@ class MethodRow:
 
 @dataclass(frozen=True, kw_only=True)
 class HandEyeReport:
-    """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
-    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given.
+    """A finished calibration: the result, the comparison, the next pose (``advice``) and the files.
+
+    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were
+    given.
     """
 
     result: HandEyeResult
@@ -108,8 +109,7 @@ class HandEyeReport:
         )
 
     def text(self) -> str:
-        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty,
-        comparison.
+        """What is printed before the first screen: directions, sketch, uncertainty, comparison.
 
         The first screen has the poses themselves, the warnings and the next pose.
         """
@@ -214,8 +214,7 @@ def undetermined(r: HandEyeResult, *, everything: bool = False) -> list[str]:
 
 
 def held_out_error(r: HandEyeResult) -> tuple[ExpectedError, float, int]:
-    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of
-    poses."""
+    """Return the held-out error in words, its 95 % in mm (NaN: none) and the number of poses."""
     used = held_out_used(r)
     seen = np.isfinite(used.translation)
     held = 1e3 * used.translation[seen]
@@ -286,8 +285,7 @@ def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
 
 
 def unknown_tables(result: HandEyeResult, mounting: Mounting, off: Mapping[str, str]) -> list[Table]:
-    """For each pose a caption and rows: component, value, one sigma; ``off`` adds words to the caption, by the pose's
-    symbol."""
+    """Make a caption and rows (component, value, sigma) for each pose; ``off`` adds words by its symbol."""
     found = []
     for k, X in result.poses.items():
         u, sigma = mounting.unknowns[k], np.sqrt(np.diag(result.covariance[k]))

@@ -1,5 +1,4 @@
-"""The result of `weldcal calibrate` on a recording in motion and its page: residuals against time, cost against the
-offset."""
+"""Write the page of `calibrate` in motion: residuals against time, cost against the clock's offset."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array
-from weldcal.tools.report.calibration import error_summary, pose_records, scanner_pose, tilt_summary
+from weldcal.tools.report.calibration import pose_records, scanner_pose, tilt_summary
 from weldcal.tools.report.first_screen import (
     NO_TOLERANCE,
     Findings,
@@ -26,7 +25,7 @@ from weldcal.tools.report.first_screen import (
     refused_note,
 )
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
-from weldcal.tools.report.render import fixed, known, render, sigma_rows
+from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
 
 
 def motion_result(
@@ -42,7 +41,7 @@ def motion_result(
     return CalibrationResult(
         X_BC=e.X_BC,
         covariance=e.covariance,
-        held_out_mm=error_summary(1e3 * e.held_out_m[e.inliers]),
+        held_out_mm=statistics(1e3 * e.held_out_m[e.inliers]),
         tilt_deg=tilt_summary(e.held_out_tilt_rad[e.inliers]),
         poses=pose_records(ids, e.inliers, values, refused),
         unobservable=e.unobservable,

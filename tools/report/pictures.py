@@ -41,8 +41,11 @@ def error_bars(
     stated: tuple[float, str] | None = None,
     median_of: str = "",
 ) -> bytes:
-    """One bar per pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` names them),
-    and ``stated`` (a height and its name) as another. Gross outliers end at the top edge, with their value."""
+    """Draw one bar per pose (n,), grey where not ``keep``, and the median of the others as a line.
+
+    ``median_of`` names them; ``stated`` (a height and its name) is another line. Gross outliers end at the top
+    edge, with their value.
+    """
     x = np.arange(len(error))
     figure, axes = subplots(8.2, 3.2)
     keep = keep & np.isfinite(error)
@@ -81,8 +84,7 @@ def error_bars(
 
 
 def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> bytes:
-    """Errors in the camera frame, across the field of view and along the line of sight: errors of the scanner form a
-    pattern."""
+    """Draw errors in the camera frame, across the view and along the line of sight: a pattern is the scanner's."""
     R = X_BC.rotation().matrix()
     seen = np.array([o.p_CR for o in observations])
     base = np.array([o.p_BR for o in observations])

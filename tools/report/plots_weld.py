@@ -68,8 +68,7 @@ class WeldTrace:
 
 
 def part_in_scan(points_B: Array, mesh: TriMesh, X_BP: RigidTransform) -> bytes:
-    """Draw where the scan (N,3) m agrees with the drawn part: its surface towards the scan, from above and from two
-    sides."""
+    """Draw where the scan (N,3) m agrees with the drawn part, from above and from two sides."""
     model = PartModel(mesh)
     scan = into(X_BP, points_B[np.isfinite(points_B).all(axis=1)])
     low, high = mesh.bounds

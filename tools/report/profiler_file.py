@@ -61,8 +61,7 @@ def pose_of(record: ProfilerRecord) -> RigidTransform:
 
 
 def middle_error_mm(record: ProfilerRecord, points_F: Array) -> float | None:
-    """Error at 95 % (mm) of a profile point in the middle of the points (n, 3) m in F, of the calibration itself; None:
-    it states none."""
+    """Compute the error at 95 % (mm) of a point in the middle of points (n, 3) m in F; None: none is stated."""
     if record.covariance is None or not len(points_F):
         return None
     S = point_covariance(pose_of(record), record.covariance, np.asarray(points_F).mean(axis=0))
@@ -71,8 +70,11 @@ def middle_error_mm(record: ProfilerRecord, points_F: Array) -> float | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProfilerFile:
-    """A calibration of a profiler from a file: ``found`` are values of its JSON object, ``points`` (n, 2) m those that
-    were measured in the scan plane, ``held_out_mm`` (k,) the errors of scans that their calibration did not use."""
+    """A calibration of a profiler from a file: ``found`` are values of its JSON object.
+
+    ``points`` (n, 2) m are those measured in the scan plane, ``held_out_mm`` (k,) the errors of scans that their
+    calibration did not use.
+    """
 
     record: ProfilerRecord
     found: Mapping[str, Any]
@@ -117,8 +119,7 @@ class ProfilerFile:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProfilerSeam:
-    """A groove that was mapped into the base: ``found`` are values of the JSON object, ``root_mm`` (n, 3) the root in
-    B."""
+    """A groove mapped into the base: ``found`` are values of the JSON object, ``root_mm`` (n, 3) the root in B."""
 
     record: ProfilerRecord
     found: Mapping[str, Any]

@@ -81,8 +81,7 @@ class PoseOutcome:
 
 @dataclass(frozen=True, eq=False)
 class PathOutcome:
-    """Deviations along the seam: arc length (n,) m, and lateral and vertical distance (n,) m from the reference
-    line."""
+    """Deviations along the seam: arc length, lateral and vertical distance (n,) m from the reference line."""
 
     s: Array
     lateral: Array
@@ -192,8 +191,7 @@ class ProfilerLive:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen: X_FS by the edge and by the sphere, each in the middle of its profiles; held-out scans back
-        them."""
+        """The first screen: X_FS by edge and by sphere in the middle of the profiles; held-out scans back them."""
         s, held = self.state, self.run.held
         against = [self.run.reason or "The job was held."] if held else []
         poses, errors, unseen, backing = [], [], 0, []

@@ -1,6 +1,6 @@
 """What every run has: its options, and the section of its report on how late each velocity left the Diagram."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -8,11 +8,18 @@ from typing import Any
 
 from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
+from weldcal.systems.wiring import Replacement
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 
 KeepPage = Callable[[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]], None]
+
+
+def run_document(run: Run[Any], options: "RunOptions", robot: str) -> dict[str, object]:
+    """Return what the JSON object of every run begins with."""
+    found = {"state": "held" if run.held else "done", "scenario": options.scenario, "seed": options.seed}
+    return {**found, "robot": robot, **({"reason": run.reason} if run.reason else {})}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +40,7 @@ class RunOptions:
         record: write recording.mcap, which `weldcal replay` plays back.
         keep_page: takes the dashboard when the run has ended, as what shows its result and what closes it; None: it
             closes at once.
+        replace: see build_cell.
     """
 
     scenario: str
@@ -48,6 +56,7 @@ class RunOptions:
     share: bool = False
     record: bool = False
     keep_page: KeepPage | None = None
+    replace: Mapping[str, Replacement] | None = None
 
 
 def robot_timing(run: Run[Any]) -> dict[str, object]:

@@ -84,8 +84,7 @@ def visits_screen(
 
 
 def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object], ended: bool = False) -> FirstScreen:
-    """Of a run in simulation: its calibration's (None: it was held before), with the errors that the simulation
-    knows."""
+    """Make the first screen of a simulated run: its calibration's (None: held before), with the true errors."""
     if first is None:
         lost = Findings(against=[reason or "The job was held."], unseen=0)
         return FirstScreen(lost, NOTHING, after_hold(ended), more={"pose": "none was found"})
@@ -125,8 +124,10 @@ _UNITS |= {"pitch": _UNITS["roll"], "yaw": _UNITS["roll"]}
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Data of the plots: landmarks (n, 2) m of the page, in-plane residuals (n, 2) m of their touches, the names of the
-    landmarks, and the camera's image (PNG bytes) with the detected landmarks."""
+    """Data of the plots: landmarks (n, 2) m of the page and in-plane residuals (n, 2) m of their touches.
+
+    Also the names of the landmarks, and the camera's image (PNG bytes) with the detected landmarks.
+    """
 
     landmark_m: Array
     miss_m: Array
@@ -332,7 +333,7 @@ def _pose(result: TabletResult) -> list[tuple[str, str]]:
         *sigma_rows(np.array(result.X_FC_covariance)),
         ("pen tip on the flange, mm", fixed_row(1e3 * np.array(result.p_FP_m), 3)),
         ("one sigma of the tip, mm", fixed_row(1e3 * pen, 3)),
-        ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),
+        ("ROS 2", export_ros2(result.X_FC, "tool0", "camera_optical_frame").strip()),
     ]
 
 

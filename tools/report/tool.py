@@ -1,5 +1,4 @@
-"""What `weldcal tool check` understood of a tool file, and its page: the tool from three sides, and what its finger
-camera sees."""
+"""Write the page of `tool check`: the tool from three sides, and what its finger camera sees."""
 
 import io
 from dataclasses import dataclass
@@ -175,8 +174,7 @@ def tool_report(check: ToolCheck, picture: bytes) -> str:
 
 
 def tool_picture(loaded: LoadedTool) -> bytes:
-    """PNG: the tool from the side (x, z), from behind (y, z) and along the flange's axis (x, y), mm in F; the camera's
-    picture."""
+    """Draw the tool in F (mm) from the side, from behind and along the flange axis, and the camera's picture."""
     figure, axes = subplots(13.0, 9.5, 2, 2)
     for at, plane, names in ((axes[0, 0], (0, 2), "xz"), (axes[0, 1], (1, 2), "yz"), (axes[1, 0], (0, 1), "xy")):
         _view(at, loaded, plane)

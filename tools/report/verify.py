@@ -11,7 +11,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
-from weldcal.tools.report.calibration import error_summary, fit_cells, interval_rows, scanner_pose
+from weldcal.tools.report.calibration import fit_cells, interval_rows, scanner_pose
 from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
@@ -24,13 +24,15 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
 )
 from weldcal.tools.report.pictures import error_bars, error_field
-from weldcal.tools.report.render import fixed, known, render
+from weldcal.tools.report.render import fixed, known, render, statistics
 
 
 @dataclass(frozen=True)
 class PoseError:
-    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face
-    normals (None where none was seen), and whether the calibration used this scan."""
+    """One scan: distance (mm) of the flange centres by calibration and robot, and angle (deg) of the normals.
+
+    The angle is None where no normal was seen; also whether the calibration used this scan.
+    """
 
     id: str
     error_mm: float
@@ -43,8 +45,10 @@ NONE = "not a verification"
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the
-    calibration states none) and the reason, a sentence."""
+    """The verdict (one of the four above), its limit for the median in mm and the reason, a sentence.
+
+    The limit is None where the calibration states none.
+    """
 
     verdict: str
     limit_mm: float | None
@@ -116,7 +120,7 @@ class VerifyReport:
     @property
     def position_error_mm(self) -> dict[str, float]:
         """Median, mean, 95th percentile and largest position error, mm."""
-        return error_summary(np.array([p.error_mm for p in self.poses]))
+        return statistics(np.array([p.error_mm for p in self.poses]))
 
     @property
     def interval_rows(self) -> dict[str, str]:
@@ -126,7 +130,7 @@ class VerifyReport:
     @property
     def tilt_deg(self) -> dict[str, float | None]:
         """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
-        found = error_summary(np.array([p.tilt_deg for p in self.poses], dtype=float))
+        found = statistics(np.array([p.tilt_deg for p in self.poses], dtype=float))
         return {key: known(found[key]) for key in ("median", "p95")}
 
     def summary(self) -> dict[str, Any]:
@@ -264,8 +268,8 @@ class TouchReport:
     @property
     def rows(self) -> dict[str, str]:
         """Rows for the terminal."""
-        f, e = self.found, error_summary(1e3 * np.abs(self.found.error_m))
-        left = error_summary(1e3 * np.abs(f.relative_m))
+        f, e = self.found, statistics(1e3 * np.abs(self.found.error_m))
+        left = statistics(1e3 * np.abs(f.relative_m))
         rows = {
             "verdict": f"{self.verdict.verdict}: {self.verdict.reason}",
             "touched - scanned": (
@@ -300,8 +304,8 @@ class TouchReport:
             "n_touches": len(f.ids),
             "inside": int(f.inside.sum()),
             "most_outside": f.most_outside,
-            "error_mm": error_summary(1e3 * np.abs(f.error_m)),
-            "relative_mm": {k: known(v) for k, v in error_summary(1e3 * np.abs(f.relative_m)).items()},
+            "error_mm": statistics(1e3 * np.abs(f.error_m)),
+            "relative_mm": {k: known(v) for k, v in statistics(1e3 * np.abs(f.relative_m)).items()},
             "touches": [
                 {
                     "id": id,

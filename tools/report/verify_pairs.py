@@ -1,14 +1,13 @@
-"""The result of `weldcal verify RESULT PAIRS` and its page: the rule of the verdict, residuals and held-out errors of
-every pair."""
+"""Write the page of `verify` on pairs: the rule of the verdict, residuals and held-out errors of every pair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
-from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,

@@ -100,8 +100,11 @@ class WeldOutcome:
 
 @dataclass(frozen=True, eq=False)
 class FeltSeam:
-    """The points of the refined seam, (N,) m: arc length on the true seam, and distance to the left of and above the
-    nominal line of a seated tip's measured centre."""
+    """The points (N,) m of the refined seam.
+
+    Arc length on the true seam, and distance to the left of and above the nominal line of a seated tip's measured
+    centre.
+    """
 
     s: Array
     lateral: Array
@@ -131,8 +134,7 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
 def live_calibration_error(
     cell: Cell[WeldJob], estimate: CalibrationEstimate, arm: ArmModel | None = None
 ) -> CalibrationError | None:
-    """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without
-    truth.
+    """Compute the error of a live calibration where scanner and arm have errors; None without truth.
 
     `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it:
     by ``arm``, the refined one, where given.
@@ -358,8 +360,7 @@ def felt_seams(run: Run[WeldJob]) -> list[bool]:
 
 
 def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
-    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical
-    sigma."""
+    """List least, mean and largest gap, misalignment and angle along a seam, mm and deg, with typical sigma."""
     if found is None:
         return {}
     rows = {}
@@ -373,8 +374,7 @@ def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
 
 
 def fit_up_csv(records: Sequence[SeamRecord]) -> str:
-    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show
-    them."""
+    """Write a line per plan and place: gap, misalignment and angle with sigmas; empty where not seen."""
     columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
     rows = []
     for record in records:

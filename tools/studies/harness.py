@@ -26,12 +26,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from weldcal.calibration.data.results import software_version
-from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
@@ -260,8 +258,7 @@ class Measured:
         return [(t.what, t.wanted, f"{t.value:.4g}", t.verdict) for t in self.targets]
 
     def outcome(self) -> Outcome:
-        """The outcome of the command: the JSON object and the table, exit code 1 where a reproduced target is
-        missed."""
+        """Return the JSON object and the table, with exit code 1 where a reproduced target is missed."""
         problem = None if self.figures["state"] != "done" else MISSED if self._fails else ""
         return Outcome(self.figures, text=self.show, problem=problem)
 
@@ -314,22 +311,6 @@ def command_line() -> str:
         k = words.index("--out")
         words = words[:k] + words[k + 2 :]
     return shlex.join(["weldcal", *(word for word in words if word != "--json")])
-
-
-def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Statistics of finite values, NaN for none: by name median, mean, rms, p95, min, max; without names median, mean,
-    p95, max."""
-    v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
-    of: dict[str, Callable[[Array], Any]] = {
-        "median": np.median,
-        "mean": np.mean,
-        "rms": lambda x: np.sqrt(np.mean(x**2)),
-        "p95": lambda x: np.percentile(x, 95),
-        "min": np.min,
-        "max": np.max,
-    }
-    chosen = names or ("median", "mean", "p95", "max")
-    return {name: float(of[name](v)) if len(v) else float("nan") for name in chosen}
 
 
 def done(results: Results) -> list[Result]:

@@ -1,5 +1,4 @@
-"""Writes one page of all measured figures from result folders of studies: what was measured, how, and what was
-found."""
+"""Write one page of all measured figures from result folders of studies."""
 
 import json
 from pathlib import Path

@@ -11,8 +11,9 @@ from weldcal.systems.runner import no_progress
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.touch import run_touches, touching
 from weldcal.tools.commands.weld import run_calibration_live
+from weldcal.tools.report.render import statistics
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.harness import Figures, Results, Row, Study, done, statistics
+from weldcal.tools.studies.harness import Figures, Results, Row, Study, done
 from weldcal.tools.worlds.touch import touch_world
 
 
@@ -88,8 +89,7 @@ _EACH = 20  # worlds of one case
 
 
 def touch_cell(scenario: str, seed: int, points: int, folder: str) -> Mapping[str, object]:
-    """Calibrate a whole simulated cell, let its soft tip touch the part, and judge: the JSON object of `verify
-    --scenario`."""
+    """Calibrate a simulated cell, touch the part with its tip, and judge: as `verify --scenario`."""
     calibrated = run_calibration_live(
         RunOptions(scenario=scenario, out=Path(folder) / f"cell{seed}", seed=seed, browser=False, recording=False)
     )

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.poses.listing import listing_of_array
-from weldcal.calibration.geometry.se3 import difference, exp_rotation, inverse, pose
+from weldcal.calibration.geometry.se3 import as_transform, difference, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_solve
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.search import Picture, offsets
 from weldcal.calibration.hand_eye.pictures.sets import picture_set, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
+from weldcal.calibration.hand_eye.solve import HandEyeConfig
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.cell.board import described_sheet

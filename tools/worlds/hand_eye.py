@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseNumbers
 from weldcal.calibration.geometry.se3 import (
+    as_transform,
     exp_rotation,
     flange_poses,
     inverse,
@@ -21,7 +22,7 @@ from weldcal.calibration.geometry.se3 import (
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform, solve_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError

@@ -10,10 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.stated_error import orientations_of
+from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
-from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.calibration.touch.touches import EDGE, PLANE, POINT, SPHERE, Touch
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm

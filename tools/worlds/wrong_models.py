@@ -98,9 +98,7 @@ def warped_observations(
 
 def _circle(X_CR: RigidTransform, center_C: Array, ratio: float) -> HolePattern:
     """The hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
-    return HolePattern(
-        holes_C=np.zeros((4, 3)), angles_rad=np.zeros(4), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0
-    )
+    return HolePattern(holes_C=np.zeros((4, 3)), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0)
 
 
 def arm_error(p_B: Array, device: int, arm_m: float) -> Array:

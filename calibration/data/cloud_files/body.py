@@ -121,8 +121,9 @@ def column_values(path: Path, content: bytes, n: int, record: int, columns: list
 def text_columns(
     path: Path, stream: BinaryIO, columns: list[int], numbers: int | None, skip: int, rows: int, lines: int
 ) -> Array:
-    """Columns (rows, k) of the text that follows in the stream: ``rows`` lines of ``numbers`` numbers (None:
-    any) after ``skip`` lines.
+    """Columns (rows, k) of the text that follows in the stream.
+
+    ``rows`` lines of ``numbers`` numbers (None: any) after ``skip`` lines.
 
     Raises CloudError where there are more or fewer than ``lines`` lines, or a line is not as promised.
     """
@@ -190,8 +191,9 @@ def _is_number(word: bytes) -> bool:
 
 
 def measured(points: Array, name: str) -> Array:
-    """The points without missing ones: NaN in a grid, left out of a list; a list in the sensor's order becomes its
-    grid.
+    """The points without missing ones: NaN in a grid, left out of a list.
+
+    A list in the sensor's order becomes its grid.
 
     Args:
         points: (N, 3), or organised (H, W, 3). A point with NaN, or at 0 0 0 (the camera's centre), was not measured.

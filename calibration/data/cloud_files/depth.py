@@ -1,5 +1,7 @@
-"""Turns depth images (PNG, TIFF, NPY) and depth maps of NPZ files into organised points by the camera's intrinsics,
-which a file beside them may state."""
+"""Turn depth images and depth maps into organised points by the camera's intrinsics.
+
+Images are PNG, TIFF or NPY, maps are in NPZ files; a file beside them may state the intrinsics.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,8 +163,10 @@ def read_depth_image(path: Path, form: CloudForm) -> Array:
 
 
 def depth_points(path: Path, pixels: Any, form: CloudForm) -> Array:
-    """Points (H, W, 3) of the pixels (H, W) of a depth image: depth along the optical axis; 0, NaN and 65535 hold
-    none."""
+    """Points (H, W, 3) of the pixels (H, W) of a depth image: depth along the optical axis.
+
+    0, NaN and 65535 hold none.
+    """
     if pixels.dtype.kind not in "fui":
         raise CloudError(f"{path.name} holds {pixels.dtype}, and depth is 16-bit or floating-point numbers.")
     check_pixels(path, pixels.size)
@@ -189,8 +193,10 @@ def check_pixels(path: Path, pixels: int) -> None:
 
 
 def back_projected(depth: Array, intrinsics: tuple[float, float, float, float]) -> Array:
-    """Points (H, W, 3) in the unit of the depths (H, W) along the optical axis; NaN where a depth is no positive
-    number."""
+    """Points (H, W, 3) in the unit of the depths (H, W) along the optical axis.
+
+    NaN where a depth is no positive number.
+    """
     fx, fy, cx, cy = intrinsics
     points = np.empty((*depth.shape, 3))
     z = points[:, :, 2]

@@ -29,8 +29,10 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """What the header says: of x, y, z the column (in text) and (offset, type) in a record; bytes and numbers of a
-    record."""
+    """What the header says: of x, y, z the column (in text) and (offset, type) in a record.
+
+    Bytes and numbers of a record.
+    """
 
     columns: tuple[int, ...]
     fields: tuple[tuple[int, str], ...]
@@ -82,8 +84,10 @@ def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
 
 
 def _in_sensor_frame(path: Path, points: Array, viewpoint: tuple[float, ...], form: CloudForm) -> Array:
-    """The points in the frame of the sensor, by VIEWPOINT (tx, ty, tz, qw, qx, qy, qz; empty: identity) and what is
-    stated of it."""
+    """Return the points in the frame of the sensor, by VIEWPOINT and what is stated of it.
+
+    VIEWPOINT is tx, ty, tz, qw, qx, qy, qz; empty: identity.
+    """
     if not viewpoint or form.viewpoint == "sensor":
         return points
     if form.viewpoint != "world":

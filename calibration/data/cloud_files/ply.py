@@ -83,8 +83,10 @@ def layout(path: Path, order: str, e: Element, content: bytes) -> tuple[int, lis
 
 
 def walked(path: Path, order: str, e: Element, content: bytes) -> tuple[NDArray[np.int64], int]:
-    """Places (n, properties) of each property of each record, bytes, and the bytes of all records, one after the
-    other."""
+    """Return the places (n, properties), in bytes, of each property of each record, and the bytes of all records.
+
+    The records follow one after the other.
+    """
     places = np.empty((e.count, len(e.properties)), dtype=np.int64)
     formats = [(int(t[1]), int(n[1]) if n else 0, _LETTERS[n] if n else "") for _, t, n in e.properties]
     at = 0
@@ -362,8 +364,10 @@ def _vertices(path: Path, order: str, e: Element, columns: list[int], content: b
 
 
 def _placed(path: Path, points: Array, of_cells: NDArray[np.int64], sides: tuple[int, int]) -> Array:
-    """The points (H, W, 3) in the cells of a range_grid, NaN in empty ones; (N, 3) where no grid of two sides is
-    stated."""
+    """The points (H, W, 3) in the cells of a range_grid, NaN in empty ones.
+
+    (N, 3) where no grid of two sides is stated.
+    """
     some = of_cells[of_cells >= 0]
     if len(some) and int(some.max()) >= len(points):
         raise CloudError(f"The file {path.name} is damaged: its range_grid names point {int(some.max())}.")

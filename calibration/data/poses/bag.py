@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.names import BASES, FLANGES
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.calibration.geometry.se3 import angle_of, inverse, pose
 from weldcal.models.arms.chain import chain_poses, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.files import MOST_POINTS
@@ -27,8 +27,11 @@ _CLOUD, _POSE, _JOINTS, _TF = "PointCloud2", "PoseStamped", "JointState", "TFMes
 
 @dataclass(frozen=True, eq=False)
 class BagScans:
-    """Scans of a recording at rest: ``ids``, X_BF (n, 4, 4) in metres, clouds (N, 3) or (H, W, 3) in metres, stamps
-    (n,) s, a phrase on what was read, and (id, reason) of those left out."""
+    """Scans of a recording at rest.
+
+    ``ids``, X_BF (n, 4, 4) in metres, clouds (N, 3) or (H, W, 3) in metres, stamps (n,) s, a phrase on what was read,
+    and (id, reason) of those left out.
+    """
 
     ids: tuple[str, ...]
     X: Array
@@ -49,8 +52,10 @@ class _Poses:
 
 
 def find_bag(folder: Path) -> Path | None:
-    """The recording of a folder: the folder itself where it has ROS 2's metadata.yaml, else its one .mcap, .db3 or .bag
-    file."""
+    """The recording of a folder.
+
+    The folder itself where it has ROS 2's metadata.yaml, else its one .mcap, .db3 or .bag file.
+    """
     if folder.is_file():
         return folder if folder.suffix.lower() in ENDINGS else None
     if (folder / "metadata.yaml").is_file():
@@ -216,8 +221,10 @@ def _flange(path: Path, s: _Poses, form: PoseForm, robot: str) -> tuple[Array, A
 
 
 def _order(path: Path, names: tuple[str, ...], n: int) -> list[int]:
-    """Positions of the arm's joints among the names, from the base to the flange; a UR's driver sorts them by the
-    alphabet."""
+    """Positions of the arm's joints among the names, from the base to the flange.
+
+    A UR's driver sorts them by the alphabet.
+    """
     ur = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     found = [next((k for k, name in enumerate(names) if part in name), -1) for part in ur]
     if n == 6 and min(found) >= 0:
@@ -325,7 +332,4 @@ def _at_rest(path: Path, clouds: list[tuple[float, Array]], times: Array, X: Arr
 
 
 def _apart(A: Array, B: Array) -> tuple[float, float]:
-    turn = A[:3, :3].T @ B[:3, :3]
-    return float(np.linalg.norm(A[:3, 3] - B[:3, 3])), float(
-        np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))
-    )
+    return float(np.linalg.norm(A[:3, 3] - B[:3, 3])), float(angle_of(A[:3, :3].T @ B[:3, :3]))

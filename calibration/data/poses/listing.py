@@ -120,8 +120,10 @@ def listing_of(
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
-    """A list of an array of a usual shape: (4, 4), (3, 4), (n, 4, 4), (n, 3, 4), (4, 4, n), (4 n, 4), (n, 16), (n, 12),
-    (n, 6), (n, 7), each also with a column of times before it, and (6, n), (7, n).
+    """A list of an array of a usual shape.
+
+    (4, 4), (3, 4), (n, 4, 4), (n, 3, 4), (4, 4, n), (4 n, 4), (n, 16), (n, 12), (n, 6), (n, 7), each also with a column
+    of times before it, and (6, n), (7, n).
 
     Raises:
         DatasetError: another shape, or no rigid poses.
@@ -278,8 +280,10 @@ def _listing(
 
 
 def _without_pose(meanings: Sequence[tuple[Array, Array]]) -> list[tuple[int, str]]:
-    """Rows that hold no pose: a number is missing, the rotation is zero, or both are those of no motion (a failed
-    detection)."""
+    """Rows that hold no pose.
+
+    a number is missing, the rotation is zero, or both are those of no motion (a failed detection).
+    """
     p, r = meanings[0]
     flat = np.concatenate([p, r.reshape(len(r), -1)], axis=1)
     missing = ~np.isfinite(flat).all(axis=1)

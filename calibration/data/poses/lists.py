@@ -82,8 +82,9 @@ def lists_of_file(path: Path) -> list[Listing]:
 
 
 def folder_lists(folder: Path, needed: int = 2, skip: frozenset[Path] = frozenset()) -> list[Listing]:
-    """Every list of poses of a folder: of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one
-    level deep.
+    """Every list of poses of a folder.
+
+    Of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one level deep.
 
     Args:
         folder: the folder.

@@ -174,8 +174,10 @@ def _whose_part(plain: str) -> str | None:
 
 @dataclass(frozen=True)
 class PoseColumn:
-    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the
-    table."""
+    """A column that is part of a pose.
+
+    Which list it belongs to, its role in a pose, its unit and its place in the table.
+    """
 
     prefix: str
     role: str

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -52,14 +53,37 @@ def _floats(text: str) -> list[float]:
     return [float(v) for v in re.findall(NUMBER, text)]
 
 
-def _rapid(text: str, name: str) -> Listing | None:
-    found = _RAPID.findall(text)
-    if not found or "[[" not in text.replace(" ", ""):
+def _listed(
+    name: str,
+    rows: Sequence[Sequence[float]],
+    form: str,
+    unit: str,
+    rotation: str = "",
+    ids: Sequence[str] = (),
+    **more: Any,
+) -> Listing | None:
+    """The list of rows (n, 6 or 7), each a position and a rotation; None without rows, and no names but unique ones."""
+    if not rows:
         return None
-    p, q = np.array([_floats(m[1]) for m in found]), np.array([_floats(m[2]) for m in found])
+    table = np.array(rows)
+    named = len(ids) == len(rows) == len(set(ids)) and all(ids)
+    more |= {"angles": "deg"} if rotation.startswith("euler") else {"angles": "rad"} if "vector" in rotation else {}
     return listing_of(
-        name, p, q, rotation="quaternion_wxyz", ids=_unique([m[0] for m in found]), unit="mm", form="ABB robtargets"
+        name,
+        table[:, :3],
+        table[:, 3:],
+        rotation=rotation,
+        ids=tuple(ids) if named else (),
+        unit=unit,
+        form=form,
+        **more,
     )
+
+
+def _rapid(text: str, name: str) -> Listing | None:
+    found = _RAPID.findall(text) if "[[" in text.replace(" ", "") else []
+    rows = [_floats(m[1]) + _floats(m[2]) for m in found]
+    return _listed(name, rows, "ABB robtargets", "mm", "quaternion_wxyz", [m[0] for m in found])
 
 
 def _kuka(text: str, name: str) -> Listing | None:
@@ -69,19 +93,7 @@ def _kuka(text: str, name: str) -> Listing | None:
         if set("XYZABC") <= set(fields):
             rows.append([fields[key] for key in "XYZABC"])
             ids.append(re.sub(r"^X(?=\w)", "", label))
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="euler_ZYX",
-        angles="deg",
-        ids=_unique(ids),
-        unit="mm",
-        form="KUKA positions",
-    )
+    return _listed(name, rows, "KUKA positions", "mm", "euler_ZYX", ids)
 
 
 def _fanuc(text: str, name: str) -> Listing | None:
@@ -94,36 +106,15 @@ def _fanuc(text: str, name: str) -> Listing | None:
         if set("XYZWPR") <= set(fields):
             rows.append([fields[k] for k in "XYZWPR"])
             fields = {}
-    if not rows:
-        return None
     ids = [f"P{number}" for number in _FANUC_POINT.findall(text)]
-    table = np.array(rows)
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="euler_xyz",
-        angles="deg",
-        ids=_unique(ids) if len(ids) == len(rows) else (),
-        unit="mm",
-        form="Fanuc positions",
-    )
+    return _listed(name, rows, "Fanuc positions", "mm", "euler_xyz", ids)
 
 
 def _transforms(text: str, name: str) -> Listing | None:
     p, q, times = _TF_P.findall(text), _TF_Q.findall(text), _TF_TIME.findall(text)
-    if not p or len(p) != len(q):
-        return None
+    rows = [_floats(a) + _floats(b) for a, b in zip(p, q, strict=True)] if len(p) == len(q) else []
     at = np.array([float(t) for t in times]) if len(times) == len(p) else None
-    return listing_of(
-        name,
-        np.array([_floats(v) for v in p]),
-        np.array([_floats(v) for v in q]),
-        rotation="quaternion_xyzw",
-        times=at,
-        unit="m",
-        form="transforms of tf2_echo",
-    )
+    return _listed(name, rows, "transforms of tf2_echo", "m", "quaternion_xyzw", times=at)
 
 
 def _ur(text: str, name: str) -> Listing | None:
@@ -133,33 +124,14 @@ def _ur(text: str, name: str) -> Listing | None:
         if not line.lstrip().startswith("#") and not _UR_SETTINGS.search(line)
         for pose in _UR.findall(line)
     ]
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="rotation_vector",
-        angles="rad",
-        unit="m",
-        form="UR poses (x, y, z, rotation vector)",
-    )
-
-
-def _unique(ids: Sequence[str]) -> tuple[str, ...]:
-    named = all(ids) and len(set(ids)) == len(ids)
-    return tuple(ids) if named else ()
+    return _listed(name, rows, "UR poses (x, y, z, rotation vector)", "m", "rotation_vector")
 
 
 def _calls(text: str, name: str) -> Listing | None:
     for word, pattern, usual, form in _CALLS:
         rows = [_floats(m) for m in re.findall(pattern, text)] if word.rstrip("(") in text else []
         if len(rows) > 1:
-            table = np.array(rows)
-            return listing_of(
-                name, table[:, :3], table[:, 3:], angles="deg", usual=usual, vector=False, unit="mm", form=form
-            )
+            return _listed(name, rows, form, "mm", angles="deg", usual=usual, vector=False)
     return None
 
 
@@ -175,10 +147,7 @@ def _yaskawa(text: str, name: str) -> Listing | None:
             f"'{name}' holds pulses of the joints, not poses. Convert the job to a relative job in base coordinates on"
             " the pendant, or write the poses that the pendant shows in base coordinates as a table x,y,z,rx,ry,rz."
         )
-    table = np.array(rows)
-    return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_xyz", angles="deg", unit="mm", form="Yaskawa positions"
-    )
+    return _listed(name, rows, "Yaskawa positions", "mm", "euler_xyz")
 
 
 def _staubli(text: str, name: str) -> Listing | None:
@@ -186,38 +155,23 @@ def _staubli(text: str, name: str) -> Listing | None:
         return None
     found = [dict(_DTX_FIELD.findall(value)) for value in _DTX.findall(text[text.index("pointRx") :])]
     rows = [[float(one[k]) for k in ("x", "y", "z", "rx", "ry", "rz")] for one in found if len(one) == 6]
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_XYZ", angles="deg", unit="mm", form="Staubli points"
-    )
+    return _listed(name, rows, "Staubli points", "mm", "euler_XYZ")
 
 
 def _ur_waypoints(text: str, name: str) -> Listing | None:
     rows = [_floats(m) for m in _URP.findall(text)] if "URProgram" in text else []
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="rotation_vector", angles="rad", unit="m", form="UR waypoints"
-    )
+    return _listed(name, rows, "UR waypoints", "m", "rotation_vector")
 
 
 def _halcon(text: str, name: str) -> Listing | None:
     found = _HALCON.findall(text)
-    if not found:
-        return None
-    code = found[0][0]
+    code = found[0][0] if found else "0"
     if code not in _HALCON_TYPES:
         raise DatasetError(
             f"'{name}' is a HALCON pose of type {code[:9]}; write it as type 0 with convert_pose_type (Rp+T, gba,"
             " point)."
         )
-    p, r = (np.array([_floats(m[k]) for m in found]) for k in (2, 1))
-    usual = _HALCON_TYPES[code]
-    angles = "rad" if usual == "rotation_vector" else "deg"
-    return listing_of(name, p, r, rotation=usual, angles=angles, unit="m", form="HALCON poses")
+    return _listed(name, [_floats(t) + _floats(r) for _, r, t in found], "HALCON poses", "m", _HALCON_TYPES[code])
 
 
 def _kawasaki(text: str, name: str) -> Listing | None:
@@ -225,19 +179,8 @@ def _kawasaki(text: str, name: str) -> Listing | None:
         return None
     block = text[text.index(".TRANS") :].partition("\n.END")[0]
     found = re.findall(rf"^[ \t]*(\w{{1,80}})[ \t]+({NUMBER}(?:[ \t]+{NUMBER}){{5}})[ \t\r]*$", block, re.MULTILINE)
-    if not found:
-        return None
-    table = np.array([_floats(m[1]) for m in found])
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="euler_ZYZ",
-        angles="deg",
-        ids=_unique([m[0] for m in found]),
-        unit="mm",
-        form="Kawasaki transformations",
-    )
+    rows = [_floats(m[1]) for m in found]
+    return _listed(name, rows, "Kawasaki transformations", "mm", "euler_ZYZ", [m[0] for m in found])
 
 
 def list_of_program(text: str, name: str) -> Listing | None:
@@ -246,19 +189,8 @@ def list_of_program(text: str, name: str) -> Listing | None:
     Raises:
         DatasetError: it holds joint angles and no poses.
     """
-    for program in (
-        _rapid,
-        _kuka,
-        _fanuc,
-        _yaskawa,
-        _staubli,
-        _kawasaki,
-        _ur_waypoints,
-        _halcon,
-        _transforms,
-        _ur,
-        _calls,
-    ):
+    arms = (_rapid, _kuka, _fanuc, _yaskawa, _staubli, _kawasaki)
+    for program in (*arms, _ur_waypoints, _halcon, _transforms, _ur, _calls):
         found = program(text, name)
         if found is not None:
             return found

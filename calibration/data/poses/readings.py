@@ -1,5 +1,7 @@
-"""Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers,
-transposition."""
+"""Enumerate the plausible readings of a list of poses.
+
+Notation of the rotation, unit and order of its numbers, transposition.
+"""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -113,8 +115,9 @@ def apply_change(X: Array, change: str) -> Array:
 
 
 def readings(numbers: PoseNumbers) -> list[PoseReading]:
-    """The readings of a list that its numbers and statements allow, the usual one first, without changes beyond the
-    stated ones.
+    """List the readings of a list that its numbers and statements allow, the usual one first.
+
+    There are no changes beyond the stated ones.
 
     Raises:
         DatasetError: no reading is possible, or a stated one contradicts the numbers.
@@ -196,11 +199,12 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     if numbers.angles == "rad" and largest > _TURN_RAD:
         raise DatasetError(
             f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they look like"
-            " degrees; state deg."
+            " degrees; state deg: 'poses: {angles: deg}' in dataset.yaml, for hand-eye --robot-form or --camera-form."
         )
     if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:
         raise DatasetError(
-            f"No angle of '{numbers.source}' exceeds {largest:.2f}, as degrees: they look like radians; state rad."
+            f"No angle of '{numbers.source}' exceeds {largest:.2f}, as degrees: they look like radians; state rad:"
+            " 'poses: {angles: rad}' in dataset.yaml, for hand-eye --robot-form or --camera-form."
         )
     units = [numbers.angles] if numbers.angles else ["deg"] if largest > _TURN_RAD else ["rad", "deg"]
     if not numbers.angles and largest <= _LEAST_DEG:

@@ -250,8 +250,10 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
 
 
 def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
-    """The list of the flange's poses among those of a file: the only one, the one of the flange's frame, or the one
-    that names the robot."""
+    """The list of the flange's poses among those of a file.
+
+    The only one, the one of the flange's frame, or the one that names the robot.
+    """
     if len(lists) == 1:
         return lists[0]
     frames = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists if " to " in one.name}
@@ -291,7 +293,7 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
     if found.unit and unit not in ("auto", found.unit):
         raise DatasetError(
             f"'{found.source}' is in {found.unit} ({found.read_as}), and dataset.yaml says poses: {unit}; correct units"
-            " in dataset.yaml."
+            f" in dataset.yaml to 'poses: {found.unit}'."
         )
     if form.frame not in _FRAMES:
         raise DatasetError(f"dataset.yaml names the frame '{form.frame[:40]}'; write {' or '.join(_FRAMES)}.")

@@ -113,8 +113,9 @@ def _element(path: Path, element: ElementTree.Element, level: int) -> Any:
 
 
 def matlab_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """The variables of a file: arrays without axes of length 1, cells as lists, structs as mappings; texts and objects
-    are left out.
+    """The variables of a file: arrays without axes of length 1, cells as lists, structs as mappings.
+
+    Texts and objects are left out.
 
     Raises:
         DatasetError: another version, or a damaged file; the sentence says what to change.

@@ -1,5 +1,7 @@
-"""Find lists of poses in text: tables with or without a header, blocks of numbers, robot programs and what ROS
-prints."""
+"""Find lists of poses in text.
+
+Tables with or without a header, blocks of numbers, robot programs and what ROS prints.
+"""
 
 import re
 from collections import defaultdict
@@ -66,8 +68,10 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
 
 
 def _keyed(text: str, name: str) -> list[Listing]:
-    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each; empty where it
-    has none."""
+    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each.
+
+    Empty where it has none.
+    """
     rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
     names = [key for key, _ in rows[0]] if len(rows) > 1 else []
     if not names or any([key for key, _ in row] != names for row in rows) or len(columns_of(names)[0]) < 6:
@@ -177,8 +181,10 @@ def _filled(line: _Line) -> int:
 
 
 def _captioned(lines: Sequence[_Line]) -> dict[str, list[_Line]] | None:
-    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``; None where the captions are
-    not of two lists."""
+    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``.
+
+    None where the captions are not of two lists.
+    """
     groups: dict[str, list[_Line]] = defaultdict(list)
     label = ""
     for line in lines:

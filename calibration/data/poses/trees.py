@@ -171,8 +171,10 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
 
 
 def _numbered(node: Mapping[Any, Any]) -> list[Mapping[Any, Any]]:
-    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1; empty where it has
-    none."""
+    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1.
+
+    Empty where it has none.
+    """
     found = {str(k): v for k, v in node.items() if isinstance(v, Mapping) and re.search(r"\d", str(k))}
     if len(found) < 3 or len({_stem(k) for k in found}) > 1 or len(found) < len(node) - 3:
         return []

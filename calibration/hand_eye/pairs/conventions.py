@@ -152,8 +152,10 @@ def _rejected(one: ReadingAgreement, best: ReadingAgreement, limit: float) -> bo
 
 
 def _same(one: ReadingAgreement, other: ReadingAgreement) -> bool:
-    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better
-    one."""
+    """Test whether two readings agree, within the residuals of the better one.
+
+    They have the same rotations, or lead to the same X and Y.
+    """
     if abs(np.log(one.scale / other.scale)) > _SAME_SCALE:
         return False
     gaps = [
@@ -284,8 +286,10 @@ def _weights(size: Array, kept: int) -> Array:
 
 
 def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
-    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear
-    starts, then alternating robust means."""
+    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3).
+
+    The better of two linear starts, then alternating robust means.
+    """
     back = np.ascontiguousarray(np.swapaxes(F, 2, 3)), np.ascontiguousarray(np.swapaxes(G, 2, 3))
     one, other = (_alternate(R, F, G, back, kept, _TRIAL_STEPS) for R in _starts(F, G))
     better = _trimmed(other[2], kept) < _trimmed(one[2], kept)
@@ -330,8 +334,9 @@ def _starts(F: Array, G: Array) -> list[Array]:
 
 
 def _about_one_axis(F: Array, G: Array, RX: Array, RY: Array, kept: int) -> tuple[Array, Array]:
-    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and
-    positions fix it.
+    """R_X and R_Y turned about the robot's axis where it turns about one only.
+
+    Rotations leave that angle open, and positions fix it.
 
     F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a,
     and of a x v.
@@ -371,8 +376,9 @@ def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array, Array]:
-    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and
-    the scale's sigma.
+    """Solve F X G = Y for t_X, t_Y (m, 3) and the scale (m,) of the camera's positions.
+
+    Also returns the residuals (m, n, 3), in F's unit, and the scale's sigma.
 
     ``turned``: R_F R_X t_G (m, n, 3). ``scale``: fixed, or None to estimate it.
     """

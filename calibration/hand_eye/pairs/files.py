@@ -1,5 +1,7 @@
-"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has
-them."""
+"""Read pose pairs.
+
+Npz, tables, documents and samples of other tools, with corners and joint angles where a file has them.
+"""
 
 import re
 from collections.abc import Mapping
@@ -19,7 +21,7 @@ from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
-from weldcal.calibration.hand_eye.pairs.importing import StatedForms, import_pairs
+from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, NEAREST_M, StatedForms, import_pairs
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -33,11 +35,14 @@ LENGTHS = UNITS
 
 @dataclass(frozen=True, kw_only=True)
 class PosePairs:
-    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a
-    second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
-    published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how
-    each list was understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
+    """Pose pairs in metres.
+
+    ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a second robot or None,
+    ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the published answer where
+    there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where given (NaN: not seen).
+    ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how each list was understood;
+    ``notes``: sentences about it; ``ids``: names of the rows, or empty.
+    """
 
     source: str
     robot: Array
@@ -98,7 +103,7 @@ def read_pairs(
     if length is not None and length not in LENGTHS:
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
     try:
-        return _read(path, mounting, length, stated or StatedForms())
+        return _pairs(path, *_contents(path), mounting, length, stated or StatedForms())
     except (DatasetError, InconsistentPoses):
         raise
     except InputError as e:
@@ -113,11 +118,6 @@ def pairs_of_lists(
     """The pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
     mounting = None if mounting is None else mounting_name(mounting)
     return _pairs(Path(names), lists, {}, mounting, length, stated)
-
-
-def _read(path: Path, mounting: str | None, length: str | None, stated: StatedForms) -> PosePairs:
-    lists, raw = _contents(path)
-    return _pairs(path, lists, raw, mounting, length, stated)
 
 
 def _pairs(
@@ -160,6 +160,8 @@ def _pairs(
     for who, one in more.items():
         X = one.readings[0].X.copy()
         X[:, :3, 3] *= found_pairs.metres
+        if who == "robot2":
+            _require_reach(X, found_pairs.reading["robot"]["unit"], path.name)
         if len(X) != found_pairs.counts[0] and (who != "link" or len(X) != 1):
             raise DatasetError(f"'{path.name}' holds {found_pairs.counts[0]} robot poses and {len(X)} {who} poses.")
         others[who] = X if len(X) == 1 and who == "link" else X[rows_r]
@@ -185,10 +187,9 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         raw = raw if isinstance(raw, dict) else {}
         units = raw.get("units")
         lists = folder_lists(path)
-        if len(lists) == 1 and any(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")):
-            raise DatasetError(
-                _pictures(path, sum(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")))
-            )
+        pictures = sum(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*"))
+        if len(lists) == 1 and pictures:
+            raise DatasetError(_pictures(path, pictures))
         if not lists:
             raise DatasetError(_no_lists(path))
         return lists, {
@@ -253,6 +254,16 @@ def _pictures(folder: Path, n: int) -> str:
         f"'{folder.name}' holds {n} pictures and no camera poses: name the board in them, for example --board"
         " chessboard:9x6:25 (inner corners and the side of a square in mm)."
     )
+
+
+def _require_reach(X: Array, unit: object, source: str) -> None:
+    """Raise DatasetError where the second robot's poses (n, 4, 4), in the first one's unit, are out of any reach."""
+    far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
+    if not NEAREST_M < far < FARTHEST_M:
+        raise DatasetError(
+            f"The second robot's positions of '{source}' have a median of {far:.3g} m from its base, in {unit} as the"
+            " first robot's: write the positions of both robots in one unit."
+        )
 
 
 def _no_lists(folder: Path) -> str:

@@ -1,5 +1,7 @@
-"""Import pairs of robot and camera poses: find the two lists, pair their rows, and let the data choose how they are
-read."""
+"""Import pairs of robot and camera poses.
+
+Find the two lists, pair their rows, and let the data choose how they are read.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,12 +21,13 @@ _FEWEST = 4  # with fewer pairs the data decide nothing
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 _DISTINCT = 1e-7  # of a rotation matrix, and of the extent of positions
 _MILLIMETRES_FROM, _METRES_TO = 80.0, 10.0  # median distances of a robot's poses from its base, in mm and m
-_NEAREST_M = 0.02  # a choice: no arm works 20 mm from its own axis
+NEAREST_M = 0.02  # a choice: no arm works 20 mm from its own axis
 FARTHEST_M = 20.0  # a choice: beyond any arm on a rail, below millimetres that are called metres
 """Median distance of a robot's poses from its base beyond which the unit is wrong."""
 SCALE_SIGMA = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
 """A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
+_OTHER_SIZE = 2.0  # a choice: no board is measured wrong by a factor of 7
 LEAST_SCALE = 0.2  # a choice: 20 %, beyond a board's wrong scale, within a factor of unit
 """Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
 it."""
@@ -329,7 +332,7 @@ def _units(
                 " nor millimetres of an arm. State the unit with --unit m, mm, cm or inch."
             )
     unit_r = UNITS[words[0]]
-    if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < _NEAREST_M):
+    if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
         raise DatasetError(
             f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]};"
             " correct --unit."
@@ -362,6 +365,12 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
         raise InconsistentPoses(
             f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct"
             f" the unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
+        )
+    if abs(np.log(factor)) > _OTHER_SIZE:
+        raise InconsistentPoses(
+            f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g}: the"
+            " robot's or the camera's positions are in another unit, or of unknown scale. State the unit of both with"
+            " --unit, or multiply the positions of one list."
         )
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
     raise WrongScale(

@@ -9,7 +9,15 @@ from scipy.optimize import brentq
 from scipy.special import fdtrc, ncfdtr
 
 from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse, log_rotation, nearest_rotation, skew
+from weldcal.calibration.geometry.se3 import (
+    IDENTITY,
+    angle_of,
+    difference,
+    inverse,
+    log_rotation,
+    nearest_rotation,
+    skew,
+)
 from weldcal.calibration.hand_eye.problem import Flags, Problem, residuals
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, fold_labels, solve_problem
 from weldcal.models.arrays import Array
@@ -209,8 +217,10 @@ class _Measure:
 
 
 def _other_forms(X: Array) -> Iterator[tuple[str, Array]]:
-    """Other poses that the same numbers may mean: inverted, another unit, transposed, axes of camera or of its parent
-    turned."""
+    """Other poses that the same numbers may mean.
+
+    Inverted, another unit, transposed, axes of camera or of its parent turned.
+    """
     yield "the inverse of RESULT", inverse(X)
     for words, scale in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("metres", 1e3)):
         scaled = X.copy()
@@ -232,7 +242,7 @@ def _other_forms(X: Array) -> Iterator[tuple[str, Array]]:
 
 
 def _turn(R: Array) -> str:
-    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
+    angle = np.degrees(angle_of(R))
     w = np.abs(log_rotation(R[None])[0])
     name = "xyz"[int(np.argmax(w))] if np.count_nonzero(w > 0.1) == 1 else "a diagonal"
     return f"{angle:.0f} degrees about {name}"

@@ -1,5 +1,4 @@
-"""Find the pictures and the camera file of a folder, search a board in them, and estimate the camera from what was
-found."""
+"""Find a folder's pictures and camera file, search a board in the pictures, and estimate the camera."""
 
 import re
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
-"""Read pictures of a board with the robot's poses: pair them, and turn symmetric boards as the robot's rotations
-say."""
+"""Read pictures of a board with the robot's poses.
+
+Pair them, and turn symmetric boards as the robot's rotations say.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +15,7 @@ from weldcal.calibration.data.poses.listing import Listing, listing_of
 from weldcal.calibration.data.poses.lists import folder_lists, together
 from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.geometry.se3 import nearest_rotation, pose
+from weldcal.calibration.geometry.se3 import angle_of, nearest_rotation, pose
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
@@ -130,18 +132,36 @@ def picture_set(
     pictures = [sized(p, size) for p in pictures]
     file = None if camera is None else camera[1]
     K, dist, free, pictures = estimate_camera(pictures, board, size, file, named is not None and named.name)
-    return _paired(
-        pictures=pictures,
-        board=board,
-        robot=robot,
-        mode=mode,
-        stated=stated or StatedForms(),
+    C = np.tile(np.eye(4), (len(pictures), 1, 1))
+    for k, picture in enumerate(pictures):
+        if not picture.why:
+            poses = solutions(picture.points, board, K, dist)
+            if poses:
+                C[k] = poses[0][1]
+            else:
+                pictures[k] = replace(picture, why="Its points give no pose of the board.")
+    found, labels = _imported(pictures, C, board, robot, mode, source, stated or StatedForms())
+    rows = np.asarray(found.rows[1], dtype=np.int64)
+    turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
+    paired = set(rows.tolist())
+    turned = [
+        p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
+    ]
+    pairs = PosePairs(
         source=source,
+        robot=found.robot,
+        camera=found.camera,
+        mode=mode,
+        img=np.stack([turned[k].points for k in rows]),
+        obj=board.points,
         K=K,
         dist=dist,
-        free=free,
-        camera="" if camera is None or len(free) else camera[0].name,
+        reading=found.reading,
+        notes=found.notes,
+        ids=tuple(turned[k].name for k in rows),
     )
+    stated_by = "" if camera is None or len(free) else camera[0].name
+    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=stated_by, free=free)
 
 
 def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str | None) -> Listing:
@@ -172,40 +192,24 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
     return replace(lists[0], unit=lists[0].unit or unit or "")
 
 
-def _paired(
-    *,
-    pictures: list[Picture],
-    board: Board,
-    robot: Listing,
-    mode: str,
-    stated: StatedForms,
-    source: str,
-    K: Array,
-    dist: Array,
-    free: NDArray[np.int64],
-    camera: str,
-) -> PictureSet:
-    """Pairs of the robot's and the boards' poses; flips of symmetric boards follow from the robot's rotations."""
-    C = np.tile(np.eye(4), (len(pictures), 1, 1))
-    for k, picture in enumerate(pictures):
-        if not picture.why:
-            found = solutions(picture.points, board, K, dist)
-            if found:
-                C[k] = found[0][1]
-            else:
-                pictures[k] = replace(picture, why="Its points give no pose of the board.")
+def _imported(
+    pictures: Sequence[Picture], C: Array, board: Board, robot: Listing, mode: str, source: str, stated: StatedForms
+) -> tuple[ImportedPairs, NDArray[np.int64]]:
+    """Pairs of the robot's and the boards' poses C (n, 4, 4), and the order of points (n,) of each picture.
+
+    Flips of symmetric boards follow from the robot's rotations.
+    """
     name = f"{pictures[0].name} ... {pictures[-1].name}"
-    labels = np.zeros(len(pictures), dtype=np.int64)
     stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None, camera_known=True)
     problem: InconsistentPoses | DatasetError | None = None
     for numbered in _numbered(robot, pictures):
-        choices: list[NDArray[np.int64]] = [labels]
+        choices = [np.zeros(len(pictures), dtype=np.int64)]
         if len(board.symmetries) > 1:
             choices = _flips(numbered, _listing(name, pictures, C), pictures, board)
         for choice in choices:
             listing = _listing(name, pictures, _flipped(C, choice, board))
             try:
-                found_pairs = import_pairs([numbered, listing], source, mode, stated)
+                return import_pairs([numbered, listing], source, mode, stated), choice
             except WrongScale as why:
                 size = 1e3 * board.size * why.factor
                 problem = InconsistentPoses(
@@ -216,44 +220,8 @@ def _paired(
                 break
             except (InconsistentPoses, DatasetError) as why:
                 problem = problem or why
-                continue
-            return _set(found_pairs, pictures, choice, board, mode, source, K, dist, free, camera)
     assert problem is not None
     raise problem
-
-
-def _set(
-    found: ImportedPairs,
-    pictures: list[Picture],
-    labels: NDArray[np.int64],
-    board: Board,
-    mode: str,
-    source: str,
-    K: Array,
-    dist: Array,
-    free: NDArray[np.int64],
-    camera: str,
-) -> PictureSet:
-    rows = np.asarray(found.rows[1], dtype=np.int64)
-    turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
-    paired = set(rows.tolist())
-    turned = [
-        p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
-    ]
-    pairs = PosePairs(
-        source=source,
-        robot=found.robot,
-        camera=found.camera,
-        mode=mode,
-        img=np.stack([turned[k].points for k in rows]),
-        obj=board.points,
-        K=K,
-        dist=dist,
-        reading=found.reading,
-        notes=found.notes,
-        ids=tuple(turned[k].name for k in rows),
-    )
-    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
 
 
 def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
@@ -271,8 +239,10 @@ def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
 
 
 def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
-    """The robot's poses with the numbers of the pictures, where rows have no names and there are more rows than
-    pictures: counted from 0 or 1."""
+    """Number the robot's poses as the pictures, where rows have no names and there are more rows than pictures.
+
+    They are counted from 0 or 1.
+    """
     numbers = [number_of(Path(p.name).stem) for p in pictures]
     if robot.ids or len(robot) == len(pictures) or None in numbers:
         return [robot]
@@ -301,8 +271,10 @@ def _turn(board: Board, order: NDArray[np.int64]) -> Array:
 
 
 def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: Board) -> list[NDArray[np.int64]]:
-    """Orders of the points of each picture that agree best with the angles of the robot's relative rotations, most
-    likely first."""
+    """Order the points of each picture by the robot's relative rotations, the most likely orders first.
+
+    The angles of the relative rotations must agree.
+    """
     rows_r, rows_c, _ = together(robot, camera)
     good = robot.good[rows_r] & camera.good[rows_c]
     rows_r, rows_c = rows_r[good], rows_c[good]
@@ -316,10 +288,10 @@ def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: 
             continue
         a, b = slice(max(shift, 0), max(shift, 0) + m), slice(max(-shift, 0), max(-shift, 0) + m)
         turned = np.einsum("nij,sjk->nsik", C[b], turns)
-        theirs = angles(np.einsum("asji,btjk->abstik", turned, turned, optimize=True))
+        theirs = angle_of(np.einsum("asji,btjk->abstik", turned, turned, optimize=True))
         for reading in robot.readings:
             R = reading.X[rows_r[a], :3, :3]
-            ours = angles(np.einsum("aji,bjk->abik", R, R, optimize=True))
+            ours = angle_of(np.einsum("aji,bjk->abik", R, R, optimize=True))
             cost = np.minimum(np.abs(theirs - ours[:, :, None, None]), 0.5)
             labels, value = _least(cost)
             whole = np.zeros(len(pictures), dtype=np.int64)
@@ -333,15 +305,11 @@ def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: 
     return [labels for _, labels in best[:8]] or [np.zeros(len(pictures), dtype=np.int64)]
 
 
-def angles(R: Array) -> Array:
-    """Angles (...) rad of rotations (..., 3, 3)."""
-    trace = np.einsum("...ii->...", R)
-    return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-
-
 def _least(cost: Array) -> tuple[NDArray[np.int64], float]:
-    """Labels (n,) of least total cost[a, b, label a, label b]: coordinate descent from the labels that each picture
-    alone suggests."""
+    """Labels (n,) of least total cost[a, b, label a, label b].
+
+    Coordinate descent from the labels that each picture alone suggests.
+    """
     n = len(cost)
     best: tuple[NDArray[np.int64], float] | None = None
     each = np.arange(n)

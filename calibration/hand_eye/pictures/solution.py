@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, moved, skew
+from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, inverse, moved, skew
 from weldcal.calibration.hand_eye.corners import poses_from_corners
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pictures.boards import Board
 from weldcal.calibration.hand_eye.pictures.search import FEWEST, GROSS, Picture, solutions
-from weldcal.calibration.hand_eye.pictures.sets import PictureSet, angles
-from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
+from weldcal.calibration.hand_eye.pictures.sets import PictureSet
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.arrays import Array
 
 _TOLERANCE = 1e-5  # of the cost: below it a step changes nothing
@@ -187,8 +187,9 @@ def adjust(
     sigma_rad: float,
     sigma_m: float,
 ) -> Bundle:
-    """Minimise the reprojection errors over camera, X, Y and an error of each robot pose, whose sizes are estimated,
-    too.
+    """Minimise the reprojection errors over camera, X, Y and an error of each robot pose.
+
+    The sizes of the errors are estimated, too.
 
     Each robot pose has a normal error of its own at the flange, with one standard deviation for all rotations and one
     for all displacements. The variances follow from the restricted likelihood (MacKay 1992: squares over the numbers
@@ -349,8 +350,9 @@ class PictureResult:
 def solve_pictures(
     data: PictureSet, solve: Callable[[PosePairs], HandEyeResult]
 ) -> tuple[HandEyeResult, PosePairs, PictureResult]:
-    """Hand-eye pose, target and camera from pictures: the poses' solution as the start, then the adjustment of the
-    corners.
+    """Hand-eye pose, target and camera from pictures.
+
+    The poses' solution as the start, then the adjustment of the corners.
 
     Returns:
         The result, with X, Y and covariance of the adjustment; the pairs under the camera that was found; what the
@@ -426,8 +428,10 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
-    """The pairs with, for each picture, the solution that lies nearest to what the result predicts: a plane and a
-    symmetric board have several."""
+    """The pairs with, for each picture, the solution that lies nearest to what the result predicts.
+
+    a plane and a symmetric board have several.
+    """
     assert pairs.img is not None
     assert pairs.K is not None
     assert pairs.dist is not None
@@ -441,9 +445,9 @@ def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[Pos
             tried += [(e, C, order) for e, C in found]
         least = min(e for e, _, _ in tried)
         close = [one for one in tried if one[0] <= _CHANGED_PX * least + 0.05]
-        off = [float(angles(one[1][:3, :3].T @ predicted[i, :3, :3])) for one in close]
+        off = [float(angle_of(one[1][:3, :3].T @ predicted[i, :3, :3])) for one in close]
         best = close[int(np.argmin(off))]
-        now = float(angles(camera[i, :3, :3].T @ predicted[i, :3, :3]))
+        now = float(angle_of(camera[i, :3, :3].T @ predicted[i, :3, :3]))
         if min(off) < 0.5 * now and now > 0.05:
             camera[i], img[i], changed = best[1], picture[best[2]], True
     return replace(pairs, camera=camera, img=img), changed

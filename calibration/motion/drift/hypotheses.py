@@ -12,8 +12,9 @@ from weldcal.models.arrays import Array
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """How a systematic error of scanner and arm varies: its sigma per axis (m, rad) and its lengths (m, and rad of the
-    normal).
+    """How a systematic error of scanner and arm varies.
+
+    Its sigma per axis (m, rad) and its lengths (m, and rad of the normal).
 
     ``novelty`` is the share of the variance that the features may leave unexplained before one more is added, up to
     ``largest`` features.
@@ -56,8 +57,10 @@ class PoseField:
         return out
 
     def features(self, p_C: Array, n_C: Array) -> tuple[Array, float]:
-        """Features (m,) at a centre (3,) m with normal (3,), grown by one where the pose is new, and the unexplained
-        share."""
+        """Return features (m,) at a centre (3,) m with normal (3,), and the unexplained share.
+
+        They are grown by one where the pose is new.
+        """
         x = np.concatenate([p_C, n_C]) * self._scale
         d = self._poses - x
         k = np.exp(-0.5 * np.einsum("ij,ij->i", d, d))
@@ -87,8 +90,11 @@ _HOURS = 3600.0  # seconds of an hour: the wander is stated per root of an hour
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
-    """What is known before: the sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale
-    wander in a cell in which nothing happens; ``change`` (SIZE,) is how large a change may be."""
+    """What is known before.
+
+    The sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander in a cell in
+    which nothing happens; ``change`` (SIZE,) is how large a change may be.
+    """
 
     clock_s: float = 5e-3
     scale: float = 3e-4
@@ -101,8 +107,9 @@ class FilterConfig:
 
 
 class DriftFilter:
-    """State x: the calibration's error [rotation; translation] about the pivot, clock (s), scale, coefficients of the
-    field.
+    """State x: the calibration's error [rotation.
+
+    Translation] about the pivot, clock (s), scale, coefficients of the field.
 
     Beside the estimate under "nothing happened" it carries, for each hypothesis "a change theta (SIZE,) from frame s
     on", the sensitivity F of the estimate to theta, and the information C and the vector d of theta in the innovations
@@ -227,8 +234,10 @@ class DriftFilter:
         P -= K @ K.T
 
     def renew_field(self) -> None:
-        """Forget what was learnt of the field, and the hypotheses, where the arm works at poses that its features do
-        not reach; what is known of error, clock and scale stays."""
+        """Forget the field and the hypotheses, where the arm works at poses that its features do not reach.
+
+        What is known of error, clock and scale stays.
+        """
         self._x[SIZE:] = 0.0
         known = self._P[:SIZE, :SIZE].copy()
         self._P[:] = 0.0
@@ -272,8 +281,11 @@ class DriftFilter:
         self.frames[on] += 1
 
     def absorb(self, k: int, change: Array, covariance: Array) -> None:
-        """Take hypothesis k, with its change (SIZE,) and covariance (SIZE, SIZE), for the truth: the estimate is from
-        then on that of the pose after the change; the field that was learnt before it stays. Clears the hypotheses."""
+        """Take hypothesis k, with its change (SIZE,) and covariance (SIZE, SIZE), for the truth.
+
+        The estimate is from then on that of the pose after the change; the field that was learnt before it stays.
+        Clears the hypotheses.
+        """
         n = self._n
         share = 1.0
         if self.kind[k] == RAMP:

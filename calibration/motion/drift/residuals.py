@@ -28,8 +28,9 @@ _LEAST_JITTER_S = 1e-5  # a few micrometres of motion
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrackedFrame:
-    """A frame: robot time (s), the feature by the robot then, in B: centre (3,) m, outward normal (3,), their rates
-    (m/s, 1/s); its fit.
+    """A frame: robot time (s), the feature by the robot then, in B.
+
+    Centre (3,) m, outward normal (3,), their rates (m/s, 1/s); its fit.
 
     ``p_CR`` (3,) m and ``n_C`` (3,) in the camera frame, after the scanner's correction; ``covariance`` (3, 3) m^2 of
     the centre and ``normal_sigma`` rad per axis: noise of the fit.
@@ -49,8 +50,11 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residuals of n frames: times (n,), r (n, 5) [m m m rad rad] in B, their derivatives (n, 5, SIZE), covariances of
-    the fits (n, 5, 5), and centres and normals (n, 3) in C. Two tilts are enough: the normal's third number follows."""
+    """Residuals of n frames.
+
+    Times (n,), r (n, 5) [m m m rad rad] in B, their derivatives (n, 5, SIZE), covariances of the fits (n, 5, 5), and
+    centres and normals (n, 3) in C. Two tilts are enough: the normal's third number follows.
+    """
 
     times: Array
     residuals: Array
@@ -68,8 +72,9 @@ class Rows:
 
 
 def tracked_rows(X_BC: RigidTransform, pivot: Array, frames: Sequence[TrackedFrame]) -> Rows:
-    """Residuals of frames (n) against a calibration: e = X_BC p_C - p_BR, and the tilt of R_BC n_C against the robot's
-    normal.
+    """Residuals of frames (n) against a calibration.
+
+    e = X_BC p_C - p_BR, and the tilt of R_BC n_C against the robot's normal.
 
     A scanner that moved by (a, b) about the pivot, X_BC' = Exp(a, b) X_BC, sees the flange where the old pose puts it
     at e = - a x (q - pivot) - b. A pose that is taken d seconds too early leaves e = v d; a scanner that measures all
@@ -92,8 +97,10 @@ def rows_of(
     covariances: Array,
     normal_sigmas: Array,
 ) -> Rows:
-    """The same from arrays: times (n,), p_BR, n_B, v_BR, turn_B, p_CR, n_C (n, 3), covariances (n, 3, 3), normal_sigmas
-    (n,)."""
+    """The same from arrays.
+
+    Times (n,), p_BR, n_B, v_BR, turn_B, p_CR, n_C (n, 3), covariances (n, 3, 3), normal_sigmas (n,).
+    """
     n = len(times)
     R, p = X_BC.rotation().matrix(), np.asarray(X_BC.translation())
     q = p_CR @ R.T + p
@@ -142,8 +149,10 @@ class FrameNoise:
     jitter_s: float = 0.0
 
     def covariance(self, fit: Array, motion: Array) -> Array:
-        """Covariance (5, 5) of a residual with the fit's (5, 5) and its derivative (5,) by the time: S + sigma_j^2 u
-        u'."""
+        """Covariance (5, 5) of a residual with the fit's (5, 5) and its derivative (5,) by the time.
+
+        S + sigma_j^2 u u'.
+        """
         factors = np.array([self.center] * 3 + [self.normal] * 2)
         return np.asarray(fit * np.outer(factors, factors) + self.jitter_s**2 * np.outer(motion, motion))
 

@@ -66,12 +66,14 @@ class DriftConfig:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DriftEvent:
-    """A change: its kind (moved, creep or warm-up), its time and when it was found (robot clock, s), and the move of
-    the scanner about its own origin in the base: translation (3,) m, rotation vector (3,) rad, their covariance (6, 6)
-    [rotation; translation], the pose after it, the test statistic and its threshold. ``model`` says what of the move is
-    significant: translation, rotation or both, and ``cause`` what residuals of the flange can tell of the cause.
-    ``since_start`` holds where the change is as old as the first frame. Of a warm-up, ``scale`` is the change of the
-    scanner's scale; the move is zero.
+    """A change that the drift test found.
+
+    ``kind`` is moved, creep or warm-up; times are of the change and of when it was found (robot clock, s). The move is
+    that of the scanner about its own origin in the base: translation (3,) m, rotation vector (3,) rad, their covariance
+    (6, 6) [rotation; translation]. The pose after it, the test statistic and its threshold follow. ``model`` says what
+    of the move is significant: translation, rotation or both, and ``cause`` what residuals of the flange show of the
+    cause. ``since_start`` holds where the change is as old as the first frame. Of a warm-up, ``scale`` is the change of
+    the scanner's scale; the move is zero.
     """
 
     kind: str
@@ -140,8 +142,11 @@ class DriftTest:
         return self._alarm_s is not None
 
     def current(self) -> tuple[RigidTransform, Array]:
-        """The scanner's pose as it is now, and its covariance (6, 6) [rotation; translation] about the camera's origin:
-        the calibration, corrected by what all frames since the last change say. This is the recalibration."""
+        """The scanner's pose as it is now, and its covariance (6, 6) [rotation.
+
+        Translation] about the camera's origin: the calibration, corrected by what all frames since the last change say.
+        This is the recalibration.
+        """
         X = moved_about(self._X_BC, self.filter.error[MOVE], self._pivot)
         return X, about(self.filter.covariance[MOVE, MOVE], -self._lever)
 
@@ -203,8 +208,11 @@ class DriftTest:
             self.noise = self._memory.noise(window, len(rows))
 
     def _changes(self, unknowns: NDArray[np.intp]) -> tuple[Array, Array, Array, Array]:
-        """Of every hypothesis (k,): estimates (k, m) of these unknowns, covariances (k, m, m), gains in twice the log
-        likelihood, and how much larger than expected the innovations stay under it (variance, at least 1)."""
+        """Of every hypothesis (k,).
+
+        Estimates (k, m) of these unknowns, covariances (k, m, m), gains in twice the log likelihood, and how much
+        larger than expected the innovations stay under it (variance, at least 1).
+        """
         f = self.filter
         pick = np.ix_(np.arange(len(f.kind)), unknowns, unknowns)
         prior = np.diag(1.0 / np.square(np.array(self.config.filter.change)[unknowns]))
@@ -216,8 +224,10 @@ class DriftTest:
         return theta, C, gain, np.maximum(left, 1.0)
 
     def _statistics(self, now: float) -> tuple[Array, Array, Array, Array]:
-        """Test statistic (k,) of a move of every hypothesis, in terms of one with six unknowns, its estimate (k, 7),
-        covariance (k, 7, 7) and variance factor."""
+        """Return the test statistic (k,) of a move of every hypothesis, in terms of one with six unknowns.
+
+        Also returns its estimate (k, 7), covariance (k, 7, 7) and variance factor.
+        """
         f, c = self.filter, self.config
         theta, C, _, left = self._changes(_RIGID)
         C = C * left[:, None, None]
@@ -344,8 +354,10 @@ class DriftTest:
         return event
 
     def _simplest(self, move: Array, cov: Array) -> tuple[str, Array, Array]:
-        """The move about the pivot and its covariance, as a pure translation or a pure rotation about the scanner's
-        origin where the data do not refuse it."""
+        """Return the move about the pivot and its covariance in the simplest form that the data do not refuse.
+
+        That is a pure translation, or a pure rotation about the scanner's origin.
+        """
         c = self.config
         S = cov + np.diag(np.repeat([c.floor_rad**2, c.floor_m**2], 3))
         W = np.linalg.inv(S)
@@ -360,8 +372,10 @@ class DriftTest:
         return ("both", move, S) if best is None else best[1:]
 
     def _when(self, k: int, gain: Array, left: Array) -> tuple[float, float]:
-        """Time (s) of the change and its sigma: mean over the hypotheses of the same kind, weighted by their
-        likelihood."""
+        """Time (s) of the change and its sigma.
+
+        Mean over the hypotheses of the same kind, weighted by their likelihood.
+        """
         f = self.filter
         least = self.config.least_frames if f.kind[k] == STEP else self.config.creep_frames
         same = np.flatnonzero((f.kind == f.kind[k]) & f.used & (f.frames >= least))

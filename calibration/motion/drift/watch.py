@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.motion.drift.hypotheses import FilterConfig
 from weldcal.calibration.motion.drift.residuals import CLOCK, FrameNoise, Rows, measured_noise, rows_of
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
@@ -41,8 +42,10 @@ _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show i
 
 @dataclass(frozen=True)
 class BackgroundMove:
-    """``share`` of the predicted move that the still background made in the camera, with its sigma, from so many
-    pixels: 1 where the scanner moved, 0 where the base did."""
+    """How much of the predicted move the still background made in the camera.
+
+    ``share`` is 1 where the scanner moved and 0 where the base did; with its ``sigma``, from so many ``pixels``.
+    """
 
     share: float
     sigma: float
@@ -59,8 +62,9 @@ class BackgroundMove:
 
 
 def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: RigidTransform) -> BackgroundMove | None:
-    """Compare organised clouds (H, W, 3) m of before and after a change, a still thing at p before being at X_AB p in
-    the camera after it if the scanner moved.
+    """Compare organised clouds (H, W, 3) m of before and after a change.
+
+    If the scanner moved, a still thing at p before is at X_AB p in the camera after it.
 
     Each pixel's median over the frames shows what stands still; the arm passes through. Along the normal, a still
     surface at p moves by n . (X_AB p - p) under its ray, and the share of it that shows is a weighted mean over all
@@ -85,7 +89,7 @@ def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: Rigid
     for _ in range(6):
         share = float((weight * told * expected).sum() / max(float((weight * expected**2).sum()), 1e-18))
         e = told - share * expected
-        scale = 1.4826 * float(np.median(np.abs(e))) + 1e-7
+        scale = MAD * float(np.median(np.abs(e))) + 1e-7
         weight = (np.abs(e) < _CLIP * scale).astype(float)
     sigma = float(np.sqrt(_CORRELATED * scale**2 / max(float((weight * expected**2).sum()), 1e-18)))
     return BackgroundMove(share, sigma, int(weight.sum()))
@@ -97,7 +101,7 @@ def _median(clouds: Sequence[Array]) -> tuple[Array, Mask]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame measured
         middle = np.nanmedian(z, axis=0)
-        spread = 1.4826 * np.nanmedian(np.abs(z - middle), axis=0)
+        spread = MAD * np.nanmedian(np.abs(z - middle), axis=0)
         ray = np.nanmedian(np.stack([c[..., :2] / c[..., 2:] for c in clouds]), axis=0)
     seen = np.isfinite(z).mean(axis=0) >= _SEEN
     point = np.concatenate([ray * middle[..., None], middle[..., None]], axis=-1)
@@ -189,8 +193,10 @@ def watch(
 def drift_config(
     sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
-    """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a
-    larger one."""
+    """The test's settings for a calibration.
+
+    Its spread of scanner and arm is that of the field, where it states a larger one.
+    """
     config = config or DriftConfig()
     spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
     clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
@@ -220,19 +226,8 @@ def _tested(
 
     def rows_with(p_C: Array, n_C: Array) -> Rows:
         """The residuals with these centres and normals of the frames."""
-        return rows_of(
-            result.X_BC,
-            pivot,
-            clock.times[order],
-            at.p[order],
-            at.n[order],
-            at.v[order],
-            at.turn[order],
-            p_C[order],
-            n_C[order],
-            frames.covariance[order],
-            frames.normal_sigma[order],
-        )
+        seen = (p_C, n_C, frames.covariance, frames.normal_sigma)
+        return rows_of(result.X_BC, pivot, *(a[order] for a in (clock.times, at.p, at.n, at.v, at.turn, *seen)))
 
     rows = rows_with(frames.p_C, frames.n_C)
     usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)
@@ -283,8 +278,10 @@ def _tested(
 
 
 def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
-    """How much later than nominal each frame was most probably taken (N,) s, and which frames show something else
-    (N,)."""
+    """Return how much later than nominal each frame was most probably taken (N,) s, and the gross frames (N,).
+
+    Gross frames show something else.
+    """
     u = rows.derivatives[:, :, CLOCK]
     factors = np.repeat([noise.center, noise.normal], [3, 2])
     S = rows.covariances * np.outer(factors, factors)

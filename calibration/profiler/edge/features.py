@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -119,7 +120,7 @@ def _robust_line(x: Floats, z: Floats) -> tuple[float, float, float, int]:
     sigma = least
     for _ in range(8):
         r = z - a - b * x
-        sigma = max(1.4826 * float(np.median(np.abs(r))), least)
+        sigma = max(MAD * float(np.median(np.abs(r))), least)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
         root = np.sqrt(weight)
         a, b = (float(v) for v in np.linalg.lstsq(np.column_stack([root, root * x]), root * z, rcond=None)[0])

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.robust import MAD
+from weldcal.calibration.geometry.se3 import frames_along, skew
 from weldcal.calibration.profiler.edge.model import (
     EdgeState,
     left_covariance,
@@ -24,14 +25,12 @@ from weldcal.calibration.profiler.edge.model import (
     predicted,
     whitened,
 )
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points, times_own, turned
-from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points, distinct, times_own, turned
+from weldcal.calibration.profiler.result import ProfilerEstimate, refuse_open, worst_direction
 from weldcal.models.errors import InputError
 
 ITERATIONS = 60
 START_SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there
-KEPT = 3  # different optima that are polished
-SAME_RAD = 0.02  # a choice: nearer ends of descents are one optimum; half only polishes the same one twice
 ROBUST = 2.5  # Cauchy scale in robust sigmas of the distances
 
 MINIMUM_POSES = 6
@@ -42,8 +41,6 @@ EFFICIENCY = 0.95  # of CAUCHY, see above
 OUTLIER = 4.5  # in sigmas of a point: one of 25 000 good points lies beyond
 SINGULAR = 1e-4  # least over largest singular value of the Jacobian with columns of unit length
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
-APART_RAD = np.radians(1.0)
-OPEN_RAD = np.radians(5.0)
 CONSISTENT_SHARE = 0.7  # a choice: up to three in ten points may be bad, as in other solvers; more is no single edge
 NEAR, SETTLED = 1e-2, 1e-7  # in sigmas of the unknowns: steps that end the descent, and the settling after it
 
@@ -63,13 +60,7 @@ def cube_rotations() -> Floats:
 def edge_starts(poses: FlangePoses, p: Floats) -> list[EdgeState]:
     """The best different optima, best first."""
     R, t, point, e, cost = _point_to_line(poses, p)
-    chosen: list[int] = []
-    for k in np.argsort(cost):
-        turn = [np.arccos(np.clip(0.5 * (np.trace(R[k].T @ R[j]) - 1.0), -1.0, 1.0)) for j in chosen]
-        if all(angle > SAME_RAD for angle in turn):
-            chosen.append(int(k))
-        if len(chosen) == KEPT:
-            break
+    chosen = distinct(R, np.argsort(cost))
     return [EdgeState(R[k], t[k], point[k], e[k]) for k in chosen]
 
 
@@ -103,7 +94,7 @@ def _point_to_line(poses: FlangePoses, p: Floats) -> tuple[Floats, Floats, Float
         unit = np.sqrt(np.einsum("mii->mi", H)) + 1e-12
         A = H / (unit[:, :, None] * unit[:, None, :]) + damping[left][:, None, None] * np.eye(10)
         step = -np.linalg.solve(A, (g / unit)[:, :, None])[:, :, 0] / unit
-        across = _tangents(e0)
+        across = frames_along(e0)[:, :, :2]
         R1, t1 = turned(R0, step[:, :3]), t[left] + step[:, 3:6]
         mean1 = mean0 + np.einsum("mij,mj->mi", across, step[:, 6:8])
         e1 = e0 + np.einsum("mij,mj->mi", across, step[:, 8:10])
@@ -134,31 +125,27 @@ def _distances(points: Floats, mean: Floats, e: Floats) -> Floats:
 
 
 def _scale(r: Floats) -> Floats:
-    return np.asarray(np.maximum(ROBUST * 1.4826 * np.median(np.linalg.norm(r, axis=2), axis=1), 1e-9))
+    return np.asarray(np.maximum(ROBUST * MAD * np.median(np.linalg.norm(r, axis=2), axis=1), 1e-9))
 
 
 def _start_costs(r: Floats, scale: Floats) -> Floats:
     return np.asarray(np.log1p(np.einsum("mni,mni->mn", r, r) / scale[:, None] ** 2).sum(axis=1) * scale**2)
 
 
-def _tangents(e: Floats) -> Floats:
-    a = np.cross(e, np.eye(3)[np.argmin(np.abs(e), axis=1)])
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    return np.stack([a, np.cross(e, a)], axis=2)
-
-
 def _linearised(
     poses: FlangePoses, R: Floats, t: Floats, mean: Floats, e: Floats, p_S: Floats
 ) -> tuple[Floats, Floats]:
-    """Distances (m, n, 3) and their Jacobian (m, n, 3, 10) by [turn in S; p_FS; line's point and direction across
-    it]."""
+    """Distances (m, n, 3) and their Jacobian (m, n, 3, 10) by [turn in S; p_FS.
+
+    Line's point and direction across it].
+    """
     m, n = len(R), len(p_S)
     points = _in_base(poses, R, t, p_S)
     off = points - mean[:, None]
     along = np.einsum("mni,mi->mn", off, e)
     r = off - along[:, :, None] * e[:, None]
     P = np.eye(3) - e[:, :, None] * e[:, None, :]
-    across = _tangents(e)
+    across = frames_along(e)[:, :, :2]
     J = np.empty((m, n, 3, 10))
     turn = -np.einsum("nij,mjk,nkl->mnil", poses.rotation, R, skew(p_S), optimize=True)
     J[..., :3] = P[:, None] @ turn
@@ -213,15 +200,18 @@ def edge_joint(
     fits = edge_optima(poses, p, sigma_robot_m, sigmas, init)
     state, cost = fits[0]
     estimate = _estimate(state, poses, p, sigma_robot_m, sigmas)
-    _refuse_rivals(estimate, [other for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2])
+    rivals = [other.rotation for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2]
+    advice = "let the edge cross the laser line at different places."
+    refuse_open(estimate.covariance, estimate.rotation, rivals, "points", advice)
     return estimate
 
 
 def edge_optima(
     poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats, init: EdgeState | None = None
 ) -> list[tuple[EdgeState, float]]:
-    """The optima of a robust loss from the 24 orientations of a cube, or the one from ``init``, and their costs, best
-    first.
+    """Find the optima of a robust loss, and their costs, best first.
+
+    Starts are the 24 orientations of a cube, or ``init`` alone.
 
     Raises:
         TooFewTranslations: fewer than six poses.
@@ -233,25 +223,6 @@ def edge_optima(
     some = np.unique(np.linspace(0, len(poses) - 1, STARTING_POSES).round().astype(int))
     starts = [init] if init is not None else edge_starts(poses[some], p[some])
     return sorted((_fitted(start, poses, p, sigma_robot_m, sigmas) for start in starts), key=lambda fit: fit[1])
-
-
-def _refuse_rivals(estimate: EdgeEstimate, others: list[EdgeState]) -> None:
-    """Another mounting that explains the points as well is not to be told from the best by its covariance, which is
-    local."""
-    sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
-    for other in others:
-        cosine = 0.5 * (np.trace(estimate.rotation.T @ other.rotation) - 1.0)
-        angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        if angle > max(APART_RAD, 5.0 * sigma):
-            raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these points alike: tilt"
-                " the flange more, about two axes, and let the edge cross the laser line at different places."
-            )
-    if sigma > OPEN_RAD:
-        raise DegenerateMotion(
-            f"These motions leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
-            " further, about two axes."
-        )
 
 
 def _system(
@@ -272,8 +243,10 @@ def _fitted(
     sigmas: Floats,
     inliers: NDArray[np.bool_] | None = None,
 ) -> tuple[EdgeState, float]:
-    """Levenberg-Marquardt with a Cauchy loss on each coordinate, of all poses or of the inliers; the state and its
-    cost."""
+    """Levenberg-Marquardt with a Cauchy loss on each coordinate, of all poses or of the inliers.
+
+    The state and its cost.
+    """
     damping = 1e-3
     _, r, J = _system(state, poses, p, sigma_robot_m, sigmas)
     cost = _cost(r, inliers)
@@ -383,8 +356,10 @@ def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: fl
 def edge_crb(
     state: EdgeState, rotation: ArrayLike, translation: ArrayLike, *, sigma_robot_m: float, sigma_xz_m: ArrayLike
 ) -> Floats:
-    """Cramer-Rao bound (6, 6) of [rotation in F; translation] for these poses and sigmas: no unbiased method does
-    better."""
+    """Cramer-Rao bound (6, 6) of [rotation in F.
+
+    Translation] for these poses and sigmas: no unbiased method does better.
+    """
     poses = FlangePoses.checked(rotation, translation)
     p, _, _ = predicted(state, poses)
     _, _, J = _system(state, poses, p, sigma_robot_m, np.asarray(sigma_xz_m, float))

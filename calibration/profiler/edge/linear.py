@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.se3 import nearest_rotation, skew
 from weldcal.calibration.profiler.motion import (
     FlangePoses,
     Floats,
@@ -32,8 +32,10 @@ ONE_EDGE = 2.0  # and over the rms within orientations, which noise and outliers
 
 @dataclass(frozen=True, eq=False)
 class EdgeLinear:
-    """The paper's result: R_FS (3, 3), p_FS (3,) m, the edge's unit direction (3,) in B and the distances (n,) m to
-    it."""
+    """The paper's result.
+
+    R_FS (3, 3), p_FS (3,) m, the edge's unit direction (3,) in B and the distances (n,) m to it.
+    """
 
     rotation: Floats
     translation: Floats
@@ -120,8 +122,7 @@ def _rotation(poses: FlangePoses, p_S: Floats, groups: list[np.ndarray]) -> Floa
         rows.append(A.reshape(-1, 9))
         right.append(-np.cross(u_t[i], u_t[j]).ravel())
     r = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
-    U, _, Vt = np.linalg.svd(r.reshape(3, 3, order="F"))
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt)
+    return nearest_rotation(r.reshape(3, 3, order="F"))
 
 
 def _kron(v: Floats, R: Floats) -> Floats:

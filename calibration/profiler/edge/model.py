@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import frames_along
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
 
 
@@ -24,7 +25,7 @@ class EdgeState:
 
     def moved(self, step: Floats) -> EdgeState:
         """Changed by (10,) [rotation in S; p_FS; two of the point, two of the direction across the edge]."""
-        across = tangents(self.direction)
+        across = frames_along(self.direction)[:, :2]
         direction = self.direction + across @ step[8:10]
         return EdgeState(
             turned(self.rotation, step[:3]),
@@ -32,13 +33,6 @@ class EdgeState:
             self.point + across @ step[6:8],
             direction / np.linalg.norm(direction),
         )
-
-
-def tangents(e: Floats) -> Floats:
-    """Two unit vectors (3, 2) across a unit vector (3,)."""
-    a = np.cross(e, np.eye(3)[int(np.argmin(np.abs(e)))])
-    a /= np.linalg.norm(a)
-    return np.column_stack([a, np.cross(e, a)])
 
 
 def predicted(state: EdgeState, poses: FlangePoses) -> tuple[Floats, Floats, Floats]:
@@ -59,7 +53,7 @@ def predicted(state: EdgeState, poses: FlangePoses) -> tuple[Floats, Floats, Flo
     # A projects along the edge onto the scan plane
     A = np.eye(3) - e[None, :, None] * n[:, None, :] / ne[:, None, None]
     by_point = np.einsum("nia,nij->naj", axes, A)
-    across = tangents(e)
+    across = frames_along(e)[:, :2]
     slope = np.einsum("nia,i->na", axes, e) / ne[:, None]
     J = np.zeros((len(poses), 2, 10))
     # turning S in itself: the point turns within the plane (about y), and the plane leaves the point (about x and z)

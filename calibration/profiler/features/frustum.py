@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -42,8 +43,9 @@ class Frustum:
 
 
 def fit_frustum(points: ArrayLike) -> Frustum:
-    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its
-    orientation.
+    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides.
+
+    Its orientation may be any.
 
     Raises:
         FeatureNotFound: fewer planes, or not like a frustum. InputError: not a cloud.
@@ -79,8 +81,10 @@ def _normals(p: Floats) -> Floats:
 
 
 def _main_direction(normals: Floats) -> Floats:
-    """The direction that most normals have: base and top are parallel; the sides' mean outward direction says which way
-    is up."""
+    """The direction that most normals have: base and top are parallel.
+
+    The sides' mean outward direction says which way is up.
+    """
     outer = normals.T @ normals
     _, vectors = np.linalg.eigh(outer)
     up = vectors[:, 2]
@@ -138,8 +142,10 @@ def _across(p: Floats, up: Floats) -> Floats:
 
 
 def _refined(p: Floats, labels: NDArray[np.intp]) -> list[Floats]:
-    """Planes (4,) [normal, d] by Tukey's weights; labels of points near a neighbouring plane are taken away, in
-    place."""
+    """Planes (4,) [normal, d] by Tukey's weights.
+
+    Labels of points near a neighbouring plane are taken away, in place.
+    """
     planes = [_plane(p[labels == k]) for k in range(6)]
     for _ in range(3):
         distance = np.abs(np.column_stack([p @ q[:3] - q[3] for q in planes]))
@@ -161,7 +167,7 @@ def _plane(p: Floats) -> Floats:
         _, vectors = np.linalg.eigh((weight[:, None] * (p - mean)).T @ (p - mean))
         n = vectors[:, 0]
         r = (p - mean) @ n
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
+        sigma = max(MAD * float(np.median(np.abs(r))), 1e-7)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
     return np.array([*n, n @ mean])
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -36,8 +37,9 @@ class GrooveFeatures:
 
 
 def groove_features(profile: ArrayLike) -> GrooveFeatures:
-    """The features of a V-groove in a profile (n, 2) [x, z] m, z growing away from the sensor, NaN where nothing
-    returned.
+    """Find the features of a V-groove in a profile (n, 2) [x, z] m.
+
+    z grows away from the sensor; NaN where nothing returned.
 
     Raises:
         FeatureNotFound: no V-groove with both walls and the plate on both sides. InputError: not a profile.
@@ -77,8 +79,9 @@ def groove_features(profile: ArrayLike) -> GrooveFeatures:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Line:
-    """z, a polynomial of u = (x - x0) / reach: its coefficients (k,) and their covariance, and the sigma of a sample
-    across it.
+    """z, a polynomial of u = (x - x0) / reach.
+
+    Its coefficients (k,) and their covariance, and the sigma of a sample across it.
 
     Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may
     still have, each with what of its power (m, 4) the polynomial leaves.
@@ -107,8 +110,10 @@ class _Line:
 
 
 def _start(x: Floats, z: Floats) -> Floats:
-    """Where the four lines meet, roughly: the plate from the outer samples, the root deepest, the edges where it
-    leaves."""
+    """Where the four lines meet, roughly.
+
+    The plate from the outer samples, the root deepest, the edges where it leaves.
+    """
     k = max(int(OUTER * len(x)), MINIMUM_SAMPLES)
     ends = np.r_[:k, len(x) - k : len(x)]
     slope, level = np.polyfit(x[ends], z[ends], 1)
@@ -146,7 +151,7 @@ def _line(x: Floats, z: Floats) -> _Line:
     for _ in range(10):
         across = 1.0 / np.hypot(1.0, b)
         r = (z - a - b * (x - x0)) * across
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
+        sigma = max(MAD * float(np.median(np.abs(r))), 1e-7)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
         a, b = _orthogonal(x - x0, z, weight)
     # of Tukey's estimate at 4 sigma, which uses nine tenths of what the samples say

@@ -37,8 +37,7 @@ def fit_circle(points: ArrayLike) -> tuple[Floats, float]:
 def find_arc(
     profile: ArrayLike, radius_m: float, *, tolerance_m: float = 0.15e-3, seed: int = 0
 ) -> tuple[NDArray[np.bool_], Floats, float]:
-    """Which samples of a profile (n, 2) [x, z] m lie on the sphere, the circle [x, z, r] m through them, and its rms in
-    m.
+    """Find the samples of a profile (n, 2) [x, z] m on the sphere, the circle [x, z, r] m through them, and its rms m.
 
     A circle of a larger radius than the sphere's cannot be a cut of it, and the sensor sees one side of it only. Random
     triples of neighbouring samples (seeded), then the longest run of samples that agree.
@@ -89,8 +88,10 @@ def _through(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _run(q: Floats, circle: Floats, tolerance_m: float, longest: NDArray[np.intp] = _NONE) -> NDArray[np.intp]:
-    """The longest stretch of samples on one side of a circle (z may grow to or from the sensor), bridging short gaps;
-    where none is longer than ``longest``, that one."""
+    """The longest stretch of samples on one side of a circle (z may grow to or from the sensor), bridging short gaps.
+
+    Where none is longer than ``longest``, that one.
+    """
     x, z = q[:, 0] - circle[0], q[:, 1] - circle[1]
     near = np.abs(np.sqrt(x * x + z * z) - circle[2]) < tolerance_m
     for side in (z < 0.0, z > 0.0):

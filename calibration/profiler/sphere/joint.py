@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, RadiusError, TooFewTranslations
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.edge.joint import cube_rotations
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, turned
-from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, distinct, times_own, turned
+from weldcal.calibration.profiler.result import ProfilerEstimate, refuse_open, worst_direction
 from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.model import (
     ParameterLayout,
@@ -30,8 +31,6 @@ from weldcal.models.errors import InputError
 
 POINTS = 7  # of each profile
 ITERATIONS = 80
-KEPT = 3
-SAME_RAD = 0.02  # as in edge/joint.py
 WORSE = 3.0  # times the best one's mean distance: what explains the sphere so badly is not polished
 
 Model = Literal["rigid", "affine", "affine+joints"]
@@ -40,7 +39,6 @@ SINGULAR = 1e-5  # a choice between rounding and poor motions, of columns of uni
 WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
 MOST_WRONG = 0.25  # of the scans may be excluded as wrong
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
-APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
 
 SCALE_SIGMAS = 3.0  # of the prior of the profiler's scale: what a sensor may be off, its radius may be
 NOISE_SIGMAS = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
@@ -86,15 +84,8 @@ def sphere_starts(
         damping = np.clip(np.where(better, 0.2 * damping, 10.0 * damping), 1e-12, 1e9)
         if (settled | (damping > 1e8)).all():
             break
-    chosen: list[int] = []
-    for k in np.argsort(cost):
-        if cost[k] > WORSE * cost.min() + 1e-9:
-            break
-        angles = [np.arccos(np.clip(0.5 * (np.trace(R[k].T @ R[j]) - 1.0), -1.0, 1.0)) for j in chosen]
-        if all(angle > SAME_RAD for angle in angles):
-            chosen.append(int(k))
-        if len(chosen) == KEPT:
-            break
+    order = np.argsort(cost)
+    chosen = distinct(R, order[cost[order] <= WORSE * cost.min() + 1e-9])
     return [(R[k], t[k], c[k]) for k in chosen]
 
 
@@ -212,7 +203,8 @@ def sphere_joint(
             x[: 9 + 3 * layout.tip] = result.x
             _, result = problem.solved(R, np.zeros(3), x)
     estimate = _estimate(problem, R, result.x)
-    _refuse_open(estimate, about, rivals)
+    advice = "cut the sphere on both sides of its middle."
+    refuse_open(estimate.covariance, about, rivals, "scans", advice)
     wrong, n = estimate.wrong_poses, len(data.poses)
     if not wrong or len(wrong) > MOST_WRONG * n or n - len(wrong) < MINIMUM_POSES:
         return estimate
@@ -220,8 +212,9 @@ def sphere_joint(
 
 
 def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, OptimizeResult]]:
-    """The optima of the rigid model from the 24 orientations of a cube, best first: a rotation R_FS (3, 3), and the
-    solution about it.
+    """The optima of the rigid model from the 24 orientations of a cube, best first.
+
+    a rotation R_FS (3, 3), and the solution about it.
 
     Raises:
         InputError, TooFewTranslations: as sphere_joint.
@@ -248,23 +241,6 @@ def _started(init: SphereEstimate, data: SphereData, layout: ParameterLayout) ->
 
 def _turned(R: Floats, x: Floats) -> Floats:
     return exp_rotation(x[:3]) @ R
-
-
-def _refuse_open(estimate: SphereEstimate, best: Floats, rivals: list[Floats]) -> None:
-    """What the covariance, which is local, does not tell: another mounting as good, or a turn hardly known at all."""
-    sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
-    for other in rivals:
-        angle = float(np.arccos(np.clip(0.5 * (np.trace(best.T @ other) - 1.0), -1.0, 1.0)))
-        if angle > max(APART_RAD, 5.0 * sigma):
-            raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these scans alike: tilt the"
-                " flange more, about two axes, and cut the sphere on both sides of its middle."
-            )
-    if sigma > OPEN_RAD:
-        raise DegenerateMotion(
-            f"These scans leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
-            " further, about two axes, and cut the sphere on both sides of its middle."
-        )
 
 
 def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None = None) -> Floats:
@@ -374,7 +350,7 @@ def _estimate(problem: SphereProblem, R0: Floats, x: Floats) -> SphereEstimate:
         )
     every = [distance[problem.of == k] for k in range(len(problem.count))]
     mean, rms = np.array([d.mean() for d in every]), np.array([np.sqrt(np.mean(d**2)) for d in every])
-    spread = max(1.4826 * float(np.median(np.abs(mean))), 0.2 * problem.sigmas.robot_m)
+    spread = max(MAD * float(np.median(np.abs(mean))), 0.2 * problem.sigmas.robot_m)
     off = (np.abs(mean) > WRONG_POSE * spread) | (rms > WRONG_POSE * np.median(rms) + problem.sigmas.robot_m)
     wrong = tuple(int(k) for k in np.flatnonzero(off))
     by_radius = problem.by_radius()

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from weldcal.calibration.errors import DegenerateMotion, RadiusError, TooFewRotations, TooFewTranslations
-from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, nearest_rotation
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_axes_spread
 from weldcal.models.errors import InputError
 
@@ -32,8 +32,10 @@ class SphereLinear:
 
 @dataclass(frozen=True, eq=False)
 class TouchSphere:
-    """A sphere felt with the tip: its centre (3,) m in B, the tip (3,) m in F, the radius and the rms of the touches in
-    m."""
+    """A sphere felt with the tip.
+
+    Its centre (3,) m in B, the tip (3,) m in F, the radius and the rms of the touches in m.
+    """
 
     center: Floats
     tip: Floats
@@ -42,8 +44,9 @@ class TouchSphere:
 
 
 def sphere_center(circle: ArrayLike, radius_m: float, sign: float) -> Floats:
-    """Centre (3,) m in S of the sphere whose cut is the circle [x, z, r] m; sign: on which side of the scan plane (y)
-    it is.
+    """Centre (3,) m in S of the sphere whose cut is the circle [x, z, r] m.
+
+    Sign: on which side of the scan plane (y) it is.
 
     Raises:
         RadiusError: the cut is larger than the sphere.
@@ -94,8 +97,7 @@ def sphere_linear(
         raise DegenerateMotion(
             "The flange turns about one axis only, which leaves the translation along it open: tilt it as well."
         )
-    U, _, Vt = np.linalg.svd((P[moved][1:] - P[moved][0]).T @ shifts)
-    R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
+    R = nearest_rotation(shifts.T @ (P[moved][1:] - P[moved][0]))
     seen = np.einsum("nij,nj->ni", poses.rotation, P @ R.T) + poses.translation
     first = int(np.flatnonzero(moved)[0])
     A = (poses.rotation[first] - poses.rotation).reshape(-1, 3)
@@ -106,8 +108,9 @@ def sphere_linear(
 def wrong_sides(
     rotation: ArrayLike, translation: ArrayLike, centers: ArrayLike, translated: ArrayLike
 ) -> tuple[int, ...]:
-    """Scans whose centre is on the other side of the scan plane than was said: with it mirrored, all centres agree far
-    better.
+    """Scans whose centre is on the other side of the scan plane than was said.
+
+    With it mirrored, all centres agree far better.
 
     One after the other, the most telling first, as long as each helps by itself: one wrong side is found, several may
     not be, and all of them wrong cannot be told. Arguments as for `sphere_linear`.

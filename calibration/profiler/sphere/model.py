@@ -24,8 +24,10 @@ ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
 
 @dataclass(frozen=True, kw_only=True)
 class SphereSigmas:
-    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the
-    priors."""
+    """What is known before.
+
+    Of the sensor's points, the robot's position at a scan and at a touch (m), and the priors.
+    """
 
     sensor_m: float = 0.05e-3
     robot_m: float = 0.03e-3  # per axis: a repeatability of 0.05 mm by ISO 9283 is a radius
@@ -243,8 +245,10 @@ class SphereProblem:
         return np.asarray(out)
 
     def shared(self, r: Floats) -> float:
-        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's
-        position."""
+        """Sum the squares of what the residuals of each scan share with an error of the robot's position.
+
+        The residuals (m,) are whitened.
+        """
         ends = np.cumsum(self.count)
         parts = zip(self._whiten or [], ends - self.count, ends, strict=False)
         return float(sum(np.sum((U.T @ r[a:b]) ** 2) for (U, _), a, b in parts))

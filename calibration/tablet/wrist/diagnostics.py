@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import TabletDataError
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS
-from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches
+from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches, linear_system
 
 _SCALE_SIGMAS, _SCALE_LEAST = 3.0, 2.5e-3
 _BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise
@@ -79,21 +79,15 @@ def touched_scale(data: WristTouches) -> tuple[float, float]:
     deviation where the touches are too few for it, or leave the pen open.
     """
     n = len(data.X_BF)
-    unknowns = 12
-    if 3 * n <= unknowns:
+    flat, b = linear_system(data)
+    if len(b) <= flat.shape[1]:
         return 1.0, np.inf
-    A, b = np.zeros((n, 3, unknowns)), np.zeros((n, 3))
-    for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
-        A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
-        A[k, :, 9:12] = -X.rotation().matrix()
-        b[k] = X.translation()
-    flat = A.reshape(-1, unknowns)
     unit = 1.0 / np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
     flat = flat * unit
     # an upright pen leaves its own length open, which no scale in the plane asks for
     N = np.linalg.pinv(flat.T @ flat, rcond=1e-10)
-    v = N @ (flat.T @ b.reshape(-1))
-    e = flat @ v - b.reshape(-1)
+    v = N @ (flat.T @ b)
+    e = flat @ v - b
     sigma2 = float(e @ e) / max(3 * n - np.linalg.matrix_rank(flat, tol=1e-5), 1)
     v, N = v * unit, sigma2 * N * np.outer(unit, unit)
     area = np.cross(v[0:3], v[3:6])
@@ -135,17 +129,14 @@ def _why_pixels(pixel: float) -> str:
 
 
 def _misfit(data: WristTouches) -> float:
-    """Rms distance (m) that the best affine plane and pen leave between touches and hands; infinite where they are too
-    few."""
+    """Rms distance (m) that the best affine plane and pen leave between touches and hands.
+
+    Infinite where they are too few.
+    """
     n = len(data.X_BF)
     if n < MIN_LANDMARKS + 1:
         return np.inf
-    flat = np.zeros((3 * n, 12))
-    for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
-        rows = slice(3 * k, 3 * k + 3)
-        flat[rows, 0:3], flat[rows, 3:6], flat[rows, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
-        flat[rows, 9:12] = -X.rotation().matrix()
-    b = np.concatenate([X.translation() for X in data.X_BF])
+    flat, b = linear_system(data)
     e = flat @ np.linalg.lstsq(flat, b, rcond=1e-8)[0] - b
     return float(np.sqrt(e @ e / n))
 

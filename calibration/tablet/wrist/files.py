@@ -113,8 +113,10 @@ _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficien
 
 @dataclass(frozen=True)
 class WristIntrinsics:
-    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV
-    distortion."""
+    """A pinhole camera with OpenCV's distortion.
+
+    Focal lengths and principal point are in px, the centre of the first pixel at (0, 0).
+    """
 
     focal_px: Array
     centre_px: Array
@@ -127,8 +129,11 @@ class WristIntrinsics:
 
 
 def load_intrinsics(path: Path) -> WristIntrinsics:
-    """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
-    distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
+    """Intrinsics from a YAML file.
+
+    Fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and distortion_coefficients (D) as
+    lists or with their `data`. Raises TabletDataError.
+    """
     try:
         text = read_text(path, LARGEST_DOCUMENT)
     except InputError as error:
@@ -182,8 +187,10 @@ _NAMES_OF_CAMERA = (CAMERA_ROW, "image", "picture")
 
 @dataclass(frozen=True)
 class WristVisit:
-    """Touches for fit_wrist, warnings about the files, the landmarks' names, and the image (h, w) with where all
-    landmarks of the page were found in it (n, 2) px, where there is one."""
+    """Touches for fit_wrist, warnings about the files, and the landmarks' names.
+
+    Where there is an image (h, w), all landmarks of the page were found in it at (n, 2) px.
+    """
 
     data: WristTouches
     warnings: tuple[str, ...]

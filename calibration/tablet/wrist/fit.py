@@ -64,8 +64,6 @@ class WristFit:
     touch_residuals_m: Array
     pixel_residuals: Array
     leave_one_out_m: Array
-    sigma_touch_m: float
-    sigma_pixel: float
     unobservable: tuple[str, ...]
 
 
@@ -105,15 +103,14 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
         touch_residuals_m=touch,
         pixel_residuals=pixel,
         leave_one_out_m=left_out,
-        sigma_touch_m=float(np.sqrt((sigma_t**2).mean())),
-        sigma_pixel=sigma_p,
         unobservable=_open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
     )
 
 
 def _touch_sigmas(touch_T: Array) -> Array:
-    """Scatter (3,) m of touch residuals (n, 3) in the tablet's frame: in its plane as the glass feels, across it as the
-    arm stands.
+    """Scatter (3,) m of touch residuals (n, 3) in the tablet's frame.
+
+    In its plane as the glass feels, across it as the arm stands.
 
     Nine unknowns are the touches', six of them in the plane. Few touches say little of each: both lean to what all say.
     """
@@ -128,8 +125,10 @@ def _touch_sigmas(touch_T: Array) -> Array:
 
 
 def measured_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
-    """Point (3,) m in the base where a ray (2,) of the camera, with the flange at ``X_BF``, meets the tablet's
-    plane."""
+    """Intersect a ray (2,) of the camera with the tablet's plane: a point (3,) m in the base.
+
+    The flange is at ``X_BF``.
+    """
     X_BC = X_BF @ fit.X_FC
     direction = X_BC.rotation().multiply(np.array([ray[0], ray[1], 1.0]))
     normal = fit.X_BT.rotation().matrix()[:, 2]
@@ -160,18 +159,22 @@ def _axis_spread(poses: tuple[RigidTransform, ...]) -> float:
     return float(np.arccos(np.clip((z @ z.T).min(), -1.0, 1.0)))
 
 
-def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransform, Array]:
-    """Closed form: R_BF p_FP + p_BF = r1 x + r2 y + p_BT for twelve unknowns, the open ones kept at the prior."""
-    n = len(data.X_BF)
-    A, b = np.zeros((n, 3, 12)), np.zeros((n, 3))
+def linear_system(data: WristTouches) -> tuple[Array, Array]:
+    """A (3 n, 12) and b (3 n,) of R_BF p_FP + p_BF = r1 x + r2 y + p_BT in r1, r2, p_BT and p_FP, three each."""
+    A = np.zeros((len(data.X_BF), 3, 12))
     for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
         A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
         A[k, :, 9:12] = -X.rotation().matrix()
-        b[k] = X.translation()
+    return A.reshape(-1, 12), np.concatenate([X.translation() for X in data.X_BF])
+
+
+def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransform, Array]:
+    """Closed form: R_BF p_FP + p_BF = r1 x + r2 y + p_BT for twelve unknowns, the open ones kept at the prior."""
+    A, b = linear_system(data)
     # columns to a like size, so that what is open is left at its prior and not shared out by units
     guess = np.r_[np.zeros(11), 0.0 if pen_length_m is None else pen_length_m]
     unit = np.r_[np.full(6, 1.0 / max(float(np.abs(data.touched_m).max()), 1e-6)), np.ones(6)]
-    flat, rest = A.reshape(-1, 12) * unit, b.reshape(-1) - A.reshape(-1, 12) @ guess
+    flat, rest = A * unit, b - A @ guess
     prior = 1e-4 * np.eye(12)[9:]
     x = guess + unit * np.linalg.lstsq(np.vstack([flat, prior]), np.r_[rest, np.zeros(3)], rcond=None)[0]
     U, _, Vt = np.linalg.svd(np.c_[x[0:3], x[3:6]], full_matrices=False)

@@ -1,5 +1,4 @@
-"""Acquisition: a worker thread that opens a device, takes its frames, reconnects, and knows at any time what is
-wrong."""
+"""Take a device's frames in a worker thread that opens it, reconnects, and knows at any time what is wrong."""
 
 import threading
 import time
@@ -81,8 +80,10 @@ class Source(Protocol[Datum]):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AcquiredFrame(Generic[Datum]):
-    """A frame with its own number (from 1, gaps where frames were lost) and its stamp; `arrived` s (host,
-    monotonic)."""
+    """A frame with its own number (from 1, gaps where frames were lost) and its stamp.
+
+    `arrived` s (host, monotonic).
+    """
 
     number: int
     datum: Datum
@@ -110,8 +111,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class Counts:
-    """What has come so far: frames, those lost or never looked at, those that could not be read, connections after the
-    first."""
+    """Frames that came, were lost, were never looked at or could not be read, and the connections after the first."""
 
     received: int = 0
     lost: int = 0  # the device's own count has a gap
@@ -138,8 +138,9 @@ class _Seen:
 
 
 class Acquisition(Generic[Datum]):
-    """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without
-    waiting.
+    """Takes a source's frames in a thread of its own.
+
+    The newest `kept` of them can be read at any time without waiting.
 
     `prepare` is applied to each frame in that thread. Whether the device is silent or late is judged by `time`.
     """
@@ -232,8 +233,10 @@ class Acquisition(Generic[Datum]):
         return next((f for f in reversed(self._frames) if f.request == number), None)
 
     def wait_for_answer(self, number: int) -> AcquiredFrame[Datum] | None:
-        """The frame that answers a request, waited for until the device is at fault: only where the Diagram may
-        wait."""
+        """The frame that answers a request, waited for until the device is at fault.
+
+        Only where the Diagram may wait.
+        """
         while (found := self.answer(number)) is None and self.fault(self.time.now()) is None:
             with self._news:
                 self._news.wait(0.05)

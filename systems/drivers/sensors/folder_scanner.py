@@ -21,9 +21,8 @@ class FolderScanner(WiredScanner):
     """
 
     folder: str = ""
-    trigger: str = (
-        ""  # tcp://HOST:PORT or file:PATH: the line `scan N`; empty: an operator or the program scans by itself
-    )
+    # tcp://HOST:PORT or file:PATH: the line `scan N`; empty: an operator or the program scans by itself
+    trigger: str = ""
     settle_s: float = 0.1  # a file is complete when it has not changed for so long
     remove_read: bool = False  # delete files that were read
 

@@ -1,5 +1,7 @@
-"""A folder into which another program writes, as a source of frames: the first complete file after a request answers
-it."""
+"""A folder into which another program writes, as a source of frames.
+
+The first complete file after a request answers it.
+"""
 
 import json
 import math
@@ -8,12 +10,12 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
+from weldcal.systems.drivers.config import check_range
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceFault, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.stamps import UnixClock, unix_now
 
@@ -25,8 +27,8 @@ LONGEST_LINE = 4096
 KEEP_ALIVE = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
-class Trigger(Protocol):
-    """Tells another program to scan."""
+class Trigger:
+    """Tells another program to scan; this one does not: that program or an operator scans once the arm is at rest."""
 
     def open(self) -> None:
         """Connect. Raises DeviceLost."""
@@ -41,23 +43,7 @@ class Trigger(Protocol):
         """Disconnect; a second call has no effect."""
 
 
-class NoTrigger:
-    """An operator, or the other program by itself, scans after the arm has come to rest."""
-
-    def open(self) -> None:
-        """See Trigger."""
-
-    def send(self, request: int) -> None:
-        """See Trigger."""
-
-    def look(self) -> None:
-        """See Trigger."""
-
-    def close(self) -> None:
-        """See Trigger."""
-
-
-class FileTrigger:
+class FileTrigger(Trigger):
     """Replaces a file as a whole: its content is the line `scan N`."""
 
     def __init__(self, path: Path) -> None:
@@ -77,16 +63,12 @@ class FileTrigger:
         except OSError as error:
             raise DeviceLost(f"the trigger file '{self._path}' cannot be written: {error.strerror}") from error
 
-    def look(self) -> None:
-        """See Trigger."""
 
-    def close(self) -> None:
-        """See Trigger."""
+class TcpTrigger(Trigger):
+    """Sends the line `scan N` over a TCP connection that stays open.
 
-
-class TcpTrigger:
-    """Sends the line `scan N` over a TCP connection that stays open; the other program may answer `ok N` or `error
-    TEXT`."""
+    The other program may answer `ok N` or `error TEXT`.
+    """
 
     def __init__(self, host: str, port: int) -> None:
         self._at = (host, port)
@@ -154,7 +136,7 @@ def trigger_of(text: str) -> Trigger:
         InputError: it is none of these.
     """
     if not text:
-        return NoTrigger()
+        return Trigger()
     if text.startswith("file:") and len(text) > 5:
         return FileTrigger(Path(text[5:]))
     host, _, port = text.removeprefix("tcp://").rpartition(":")
@@ -169,14 +151,6 @@ def trigger_of(text: str) -> Trigger:
 Signature = tuple[int, int, int]  # inode, size, time of the last change (ns)
 SET_S = 0.5  # by which the computer's clock is set and not only disciplined
 UNFINISHED = (".tmp", ".part", ".partial", ".crdownload")
-
-
-@dataclass
-class _Growing:
-    """A file that may still be written: its signature, and when (s, monotonic) it was first seen with it."""
-
-    signature: Signature
-    since: float
 
 
 class NewFiles:
@@ -194,7 +168,7 @@ class NewFiles:
         self._folder, self._suffixes, self._settle_s, self._unix = folder, suffixes, settle_s, unix
         self._offset = unix() - time.monotonic()
         self._known: dict[str, Signature] = {}
-        self._growing: dict[str, _Growing] = {}
+        self._growing: dict[str, tuple[Signature, float]] = {}  # and since when it has that signature, s
 
     def start(self) -> None:
         """Take what is there now as old. Raises OSError where the folder cannot be read."""
@@ -216,10 +190,9 @@ class NewFiles:
         for name, signature in listed.items():
             if signature == self._known.get(name) or signature[1] == 0:
                 continue
-            growing = self._growing.get(name)
-            if growing is None or growing.signature != signature:
-                growing = self._growing[name] = _Growing(signature, now)
-            unchanged_s = now - growing.since
+            if self._growing.get(name, (None, now))[0] != signature:
+                self._growing[name] = (signature, now)
+            unchanged_s = now - self._growing[name][1]
             if not clock_was_set:
                 unchanged_s = max(unchanged_s, unix - 1e-9 * signature[2])
             if unchanged_s >= self._settle_s:
@@ -257,8 +230,10 @@ SIDECAR = ".json"
 
 
 class FolderSource(Source[Datum]):
-    """What `read` makes of the files of some suffixes; it raises InputError for one that may not be complete, Garbage
-    for a bad one."""
+    """What `read` makes of the files of some suffixes.
+
+    It raises InputError for one that may not be complete, Garbage for a bad one.
+    """
 
     def __init__(
         self,
@@ -274,8 +249,7 @@ class FolderSource(Source[Datum]):
         if not folder:
             kind = f"Folder{device.capitalize()}"
             raise InputError(f"Write the folder of its files in the scenario: {device}: !{kind} {{folder: scans}}.")
-        if not 0.0 <= settle_s <= 60.0:
-            raise InputError(f"{device}.settle_s must be from 0 to 60, and it is {settle_s:g}.")
+        check_range(f"{device}.settle_s", settle_s, 0.0, 60.0)
         self.folder, self.name = Path(folder), f"{name} that writes into '{folder}'"
         self._read_file, self._remove_read, self._triggered = read, remove_read, bool(trigger)
         self._files = NewFiles(self.folder, suffixes, settle_s)
@@ -375,8 +349,7 @@ class FolderSource(Source[Datum]):
         )
 
     def _sidecar(self, path: Path) -> tuple[float | None, int | None, float | None, str]:
-        """Capture time (Unix, s), request's number, the time of the scanner's own clock (s), and where the time is
-        from."""
+        """Capture time (Unix, s), request's number, time of the scanner's own clock (s), and where the time is from."""
         beside = path.with_suffix(SIDECAR)
         if not beside.is_file():
             return None, None, None, "its arrival"

@@ -1,5 +1,7 @@
-"""A source in a process of its own: a device's library that crashes, or keeps Python's lock, does not touch the control
-loop."""
+"""A source in a process of its own.
+
+A device's library that crashes, or keeps Python's lock, does not touch the control loop.
+"""
 
 import multiprocessing
 import os

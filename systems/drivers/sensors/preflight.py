@@ -1,5 +1,7 @@
-"""What sensors by wire show before a job: one scan, or the pictures of a second, and what to change where they do
-not."""
+"""What sensors by wire show before a job.
+
+One scan, or the pictures of a second, and what to change where they do not.
+"""
 
 import time
 from dataclasses import dataclass, field

@@ -23,8 +23,7 @@ QUEUE = 4
 
 
 def _stereo(name: str, fov_deg: float, near: float, far: float, optimum: float, sigma: float) -> ScannerPreset:
-    """A stereo camera of 1280 x 720; its field of view and range are those of Intel's data sheet, its noise is
-    typical."""
+    """A stereo camera of 1280 x 720: view and range as in Intel's data sheet, typical noise."""
     f = 640.0 / np.tan(np.deg2rad(0.5 * fov_deg))
     noise = DepthNoise(sigma_m=sigma, reference_m=optimum, edge_step_m=0.01, flying=0.5, edge_dropout=0.2)
     return ScannerPreset(

@@ -25,8 +25,10 @@ RELEARN_S = 3.0  # frames that stay late for so long belong to another offset: t
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a frame was captured (s, host monotonic), by which clock, and how much later than the earliest frames it
-    came (s)."""
+    """When a frame was captured (s, host monotonic), by which clock, and by how much it came late (s).
+
+    Late is what came after the earliest frames.
+    """
 
     captured: float
     clock: str  # device, host or arrival
@@ -75,8 +77,9 @@ class UnixClock:
 
 
 class EarliestLine:
-    """The line below all (device time, arrival - device time), s, that is nearest to them: offset and drift of two
-    clocks.
+    """The line below all (device time, arrival - device time), s, that is nearest to them.
+
+    Offset and drift of two clocks.
 
     A frame can only be late. Of the lines that no frame undercuts, the one with the smallest mean distance is an edge
     of the lower convex hull, above the mean time (Moon, Skelly and Towsley, Estimation and removal of clock skew from
@@ -189,8 +192,10 @@ class DiagramTime:
         self._diagram.append(diagram_s)
 
     def at(self, host_s: float) -> float:
-        """The Diagram's time (s) at a host time; minus infinity before the first note, the newest note's after the
-        last."""
+        """The Diagram's time (s) at a host time.
+
+        Minus infinity before the first note, the newest note's after the last.
+        """
         k = bisect_right(self._host, host_s)
         if k == 0:
             return float("-inf")
@@ -229,8 +234,9 @@ class HostTime:
 
 
 class FollowedTime:
-    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for
-    the cell.
+    """The clock of a robot that the cell follows.
+
+    Its world may be slower than real time, and stands while it waits for the cell.
 
     The threads of the acquisition and of the Diagram both ask it.
     """

@@ -3,31 +3,23 @@
 import dataclasses as dc
 import time
 from collections.abc import Callable
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol
 
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition
-from weldcal.systems.drivers.sensors.stamps import CellTime, DiagramTime
+from weldcal.systems.drivers.sensors.stamps import CellTime, DiagramTime, cell_time
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
-from weldcal.systems.messages import Message, UrStatus
+from weldcal.systems.messages import UrStatus
 
-Shown = TypeVar("Shown", bound=Message)
-Made = TypeVar("Made", bound=Message, covariant=True)
 PERIOD_S = 0.008  # two periods of the commands: a tenth of the shortest time after which a device is silent
+START_S = 10.0  # a choice: several attempts to connect, as in preflight.py; a device that opens in 5 s has one retry
 STOOD_S = 0.1  # a longer time between two looks: the Diagram computed, with the arm at rest
 
 
-class Maker(Protocol[Made]):
-    """Makes the message on the port from number, capture time and datum; without arguments the empty one."""
-
-    def __call__(self, sequence: int = ..., capture_time: float = ..., datum: NDArray[Any] = ..., /) -> Made: ...
-
-
-class OnTrigger(LeafSystem, Generic[Shown]):
+class OnTrigger(LeafSystem):
     """Asks the device for one datum per trigger.
 
     .. pydrake_system::
@@ -38,13 +30,14 @@ class OnTrigger(LeafSystem, Generic[Shown]):
         output_ports:
         - scan
 
-    The output port has the name `port`, such as scan or profile. The Diagram does not wait for the answer, unless it
+    The output port has the name `port`, such as scan or profile; `message` is made of a number, the capture time
+    and the datum. The Diagram does not wait for the answer, unless it
     may (`waits`). The capture time is that of the datum's stamp, and at the earliest that of its trigger: from then on
     the arm is at rest.
     """
 
     def __init__(
-        self, acquisition: Acquisition[Any], port: str, message: Maker[Shown], period_s: float, waits: bool = False
+        self, acquisition: Acquisition[Any], port: str, message: type[Any], period_s: float, waits: bool = False
     ) -> None:
         super().__init__()
         self.acquisition, self._message, self._waits = acquisition, message, waits
@@ -138,7 +131,13 @@ class DeviceWatch(LeafSystem):
 def watch(build: StationBuild, device: SelfTestingDevice, name: str) -> None:
     """Let the station close a device, and let the robot's status show the device's faults."""
     build.closables.append(device)
-    watching = build.builder.AddSystem(DeviceWatch(device))
-    watching.set_name(f"{name}_watch")
-    build.builder.Connect(build.outputs["arm.status"], watching.GetInputPort("robot_status"))
-    build.outputs["arm.status"] = watching.GetOutputPort("status")
+    status = build.outputs["arm.status"]
+    watching = build.add(f"{name}_watch", DeviceWatch(device), "arm.status")
+    build.builder.Connect(status, watching.GetInputPort("robot_status"))
+
+
+def begin(build: StationBuild, acquisition: Acquisition[Any], name: str, *, first_frame: bool) -> None:
+    """Start a device's acquisition in a station, and watch it. Raises DeviceFault where it does not answer."""
+    acquisition.time = cell_time(build)
+    acquisition.start(START_S, first_frame=first_frame)
+    watch(build, acquisition, name)

@@ -16,8 +16,8 @@ from weldcal.models.tool import FingerCamera
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
-from weldcal.systems.drivers.sensors.watch import watch
+from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.drivers.sensors.watch import begin
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Image
@@ -37,9 +37,8 @@ class WiredFingerCamera(FingerCameraConfig):
     latency_s: float = 0.0  # from the middle of the exposure to the arrival; with stamps: that of the earliest pictures
     exposure_ms: float | None = None  # null: as the camera has it
     gain: float | None = None
-    calibration: str = (
-        ""  # file of `weldcal finger calibrate`: its focal length, distortion and tag take the place of focal_px
-    )
+    # file of `weldcal finger calibrate`: its focal length, distortion and tag take the place of focal_px
+    calibration: str = ""
     silent_s: float = 0.5  # without a usable picture: a fault
     frozen_s: float = 0.5  # with identical pictures: a fault
     late_s: float = 0.5  # that a picture comes late: a fault
@@ -143,18 +142,13 @@ def acquire_pictures(config: WiredFingerCamera, source: Source[Picture]) -> Acqu
     return Acquisition(source, config.rules(), kept=3, latency_s=config.latency_s, prepare=prepare)
 
 
-def add_camera(config: WiredFingerCamera, source: Source[Picture], build: StationBuild, start_s: float = 10.0) -> None:
+def add_camera(config: WiredFingerCamera, source: Source[Picture], build: StationBuild) -> None:
     """Start the acquisition and add the camera's system with its ports to the station.
 
     Raises:
         DeviceFault: the camera sends no picture.
     """
     acquisition = acquire_pictures(config, source)
-    acquisition.time = cell_time(build)
-    acquisition.start(start_s, first_frame=True)
-    watch(build, acquisition, "finger_camera")
-    camera = build.builder.AddSystem(WiredPictures(acquisition))
-    camera.set_name("finger_camera")
-    build.inputs["finger_camera.streaming"] = camera.GetInputPort("streaming")
-    build.outputs["finger_camera.image"] = camera.GetOutputPort("image")
-    build.outputs["finger_camera.capture_time"] = camera.GetOutputPort("capture_time")
+    begin(build, acquisition, "finger_camera", first_frame=True)
+    ports = (f"finger_camera.{port}" for port in ("streaming", "image", "capture_time"))
+    build.add("finger_camera", WiredPictures(acquisition), *ports)

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.stamps import cell_time
-from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
+from weldcal.systems.drivers.sensors.watch import OnTrigger, begin
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import ProfileScan
@@ -55,17 +54,13 @@ def acquire_profiles(config: WiredProfiler, source: Source[Profile]) -> Acquisit
     return Acquisition(source, rules, kept=2, latency_s=config.latency_s)
 
 
-def add_profiler(config: WiredProfiler, source: Source[Profile], build: StationBuild, start_s: float = 10.0) -> None:
+def add_profiler(config: WiredProfiler, source: Source[Profile], build: StationBuild) -> None:
     """Start the acquisition and add the profiler's system with its ports to the station.
 
     Raises:
         DeviceFault: the profiler does not answer.
     """
     acquisition = acquire_profiles(config, source)
-    acquisition.time = cell_time(build)
-    acquisition.start(start_s, first_frame=False)
-    watch(build, acquisition, "profiler")
-    system = build.builder.AddSystem(OnTrigger(acquisition, "profile", ProfileScan, PERIOD_S, build.may_wait))
-    system.set_name("profiler")
-    build.inputs["profiler.trigger"] = system.GetInputPort("trigger")
-    build.outputs["profiler.profile"] = system.GetOutputPort("profile")
+    begin(build, acquisition, "profiler", first_frame=False)
+    system = OnTrigger(acquisition, "profile", ProfileScan, PERIOD_S, build.may_wait)
+    build.add("profiler", system, "profiler.trigger", "profiler.profile")

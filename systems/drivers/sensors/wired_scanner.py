@@ -1,5 +1,7 @@
-"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a
-stream."""
+"""What all scanners by wire share.
+
+Their configuration, the system that asks for scans, and the one that shows a stream.
+"""
 
 import dataclasses as dc
 import time
@@ -12,10 +14,10 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
-from weldcal.systems.drivers.config import ScannerConfig
+from weldcal.systems.drivers.config import ScannerConfig, check_range
 from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
-from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
+from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.drivers.sensors.watch import OnTrigger, begin
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Scan, ScanStream, StreamedScan
@@ -68,14 +70,10 @@ class WiredScanner(ScannerConfig):
     def rules(self) -> Rules:
         """When this scanner is at fault. Raises InputError for a time that no scan takes."""
         low, high = SCAN_TIMEOUTS_S
-        if not low <= self.scan_timeout_s <= high:
-            raise InputError(
-                f"scanner.scan_timeout_s must be from {low:g} to {high:g}, and it is {self.scan_timeout_s:g}."
-            )
+        check_range("scanner.scan_timeout_s", self.scan_timeout_s, low, high)
         if self.streams:
             for name in ("silent_s", "late_s"):
-                if not 0.1 <= getattr(self, name) <= high:
-                    raise InputError(f"scanner.{name} must be from 0.1 to {high:g}, and it is {getattr(self, name):g}.")
+                check_range(f"scanner.{name}", getattr(self, name), 0.1, high)
             return Rules(silent_s=self.silent_s, frozen_s=self.silent_s, late_s=self.late_s)
         return Rules(late_s=float("inf"), answer_s=self.scan_timeout_s)
 
@@ -167,24 +165,17 @@ def acquire(config: WiredScanner, source: Source[Cloud]) -> Acquisition[Cloud]:
     return Acquisition(source, config.rules(), kept=kept, latency_s=config.latency_s)
 
 
-def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild, start_s: float = 10.0) -> None:
+def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild) -> None:
     """Start the acquisition and add the scanner's system with its ports to the station.
 
     Raises:
         DeviceFault: the scanner does not answer.
     """
     acquisition = acquire(config, source)
-    acquisition.time = cell_time(build)
-    acquisition.start(start_s, first_frame=config.streams)
-    watch(build, acquisition, "scanner")
+    begin(build, acquisition, "scanner", first_frame=config.streams)
     if config.streams:
         clock = None if build.robot is None else build.robot.clock
-        stream = build.builder.AddSystem(WiredScanStream(acquisition, clock))
-        build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
-        build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
-        stream.set_name("scanner")
+        build.add("scanner", WiredScanStream(acquisition, clock), "scanner.streaming", "scanner.stream")
         return
-    sensor = build.builder.AddSystem(OnTrigger(acquisition, "scan", Scan, PERIOD_S, build.may_wait))
-    sensor.set_name("scanner")
-    build.inputs["scanner.trigger"] = sensor.GetInputPort("trigger")
-    build.outputs["scanner.scan"] = sensor.GetOutputPort("scan")
+    sensor = OnTrigger(acquisition, "scan", Scan, PERIOD_S, build.may_wait)
+    build.add("scanner", sensor, "scanner.trigger", "scanner.scan")

@@ -1,5 +1,7 @@
-"""A separate scene graph for a camera, and a stand that is knocked; its poses are updated only when a picture is
-taken."""
+"""A separate scene graph for a camera, and a stand that is knocked.
+
+Its poses are updated only when a picture is taken.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -75,8 +77,7 @@ def add_picture_scene(
         renderer: name of the VTK renderer created for the scene.
         mount: name of the body that carries the camera; None: the camera is fixed.
     """
-    scene = builder.AddSystem(SceneGraph())
-    scene.set_name(f"{renderer}_scene")
+    scene = builder.AddNamedSystem(f"{renderer}_scene", SceneGraph())
     scene.AddRenderer(renderer, MakeRenderEngineVtk(RenderEngineVtkParams()))
     source = scene.RegisterSource("world")
     inspector = drawn.model_inspector()
@@ -100,8 +101,7 @@ def add_picture_scene(
         else:
             scene.RegisterGeometry(source, frame_of(body), copy)
     del frames[world]
-    poses = builder.AddSystem(PicturePoses(plant, frames))
-    poses.set_name(f"{renderer}_poses")
+    poses = builder.AddNamedSystem(f"{renderer}_poses", PicturePoses(plant, frames))
     builder.Connect(plant.get_body_poses_output_port(), poses.GetInputPort("body_poses"))
     builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
     return PictureScene(scene, renderer, frames, poses)
@@ -133,12 +133,13 @@ class DisplacedStand(LeafSystem):
 
 
 def add_stand(builder: DiagramBuilder, scene: PictureScene, time_s: float, displacement: RigidTransform) -> FrameId:
-    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``; returns its frame in the camera's
-    scene."""
+    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``.
+
+    Returns its frame in the camera's scene.
+    """
     graph = scene.scene_graph
     source = graph.RegisterSource("stand")
     frame = graph.RegisterFrame(source, GeometryFrame("stand"))
-    stand = builder.AddSystem(DisplacedStand(frame, time_s, displacement))
-    stand.set_name("knocked_stand")
+    stand = builder.AddNamedSystem("knocked_stand", DisplacedStand(frame, time_s, displacement))
     builder.Connect(stand.GetOutputPort("frame_poses"), graph.get_source_pose_port(source))
     return frame

@@ -21,8 +21,10 @@ MASS_KG = 0.9  # a choice: a torch and a small profiler together; it only loads 
 
 @dataclass(frozen=True, eq=False)
 class ProfilerTruth(Message):
-    """Ground truth of the simulation: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre
-    in B."""
+    """Ground truth of the simulation.
+
+    X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre in B.
+    """
 
     X_FS: RigidTransform
     p_FTip: Array
@@ -34,8 +36,7 @@ class ProfilerTruth(Message):
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFixture(Message):
-    """Ground truth and job, the pose of the straightedge, and the ray-cast objects: (mesh in B, darkness 0 to 1)
-    each."""
+    """Ground truth and job, the straightedge's pose, and the ray-cast objects: (mesh in B, darkness 0 to 1) each."""
 
     truth: ProfilerTruth
     X_BE: RigidTransform
@@ -45,17 +46,8 @@ class ProfilerFixture(Message):
     time_step_s: float = 0.004  # of the plant: nothing in it is more compliant than the arm's servos
 
 
-@dataclass(frozen=True, eq=False)
-class TouchPair(Message):
-    """The two geometries whose contact counts as a touch, and the index of the body with the tip."""
-
-    tip: GeometryId
-    ball: GeometryId
-
-
 def straightedge_mesh(length_m: float, width_m: float) -> TriMesh:
-    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, both sides bevelled
-    inwards."""
+    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, bevelled inwards."""
     section = np.array([[0.0, 0.0], [width_m, 0.0], [width_m - BEVEL_M, -BEVEL_M], [BEVEL_M, -BEVEL_M]])
     ends = [np.column_stack([np.full(4, x), section]) for x in (-0.5 * length_m, 0.5 * length_m)]
     triangles = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]]
@@ -95,8 +87,11 @@ def rig_points(tip_F: Array, X_FS: RigidTransform) -> tuple[Array, Array]:
 
 def add_fixture(
     plant: MultibodyPlant, arm: ModelInstanceIndex, fixture: ProfilerFixture, table_z_m: float
-) -> TouchPair:
-    """Add the fixture to a plant that is not finalised; only the tip and the sphere have contact geometry."""
+) -> frozenset[GeometryId]:
+    """Add the fixture to a plant that is not finalised; only the tip and the sphere have contact geometry.
+
+    Returns these two geometries.
+    """
     truth, job = fixture.truth, fixture.job
     rig = plant.AddModelInstance("profiler_rig")
     inertia = SpatialInertia(MASS_KG, np.zeros(3), UnitInertia.SolidBox(0.16, 0.07, 0.12))
@@ -137,7 +132,7 @@ def add_fixture(
     ball = plant.RegisterCollisionGeometry(
         ground, RigidTransform(truth.center), Sphere(truth.radius_m), "ball_contact", touching
     )
-    return TouchPair(tip, ball)
+    return frozenset((tip, ball))
 
 
 def _show_torch(show: object, plate: object, tip: Array, rgba: tuple[float, ...]) -> None:

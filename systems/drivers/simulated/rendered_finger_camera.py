@@ -47,8 +47,7 @@ class TagView:
         )
 
     def picture(self, X_FM: RigidTransform) -> Pixels:
-        """The grey picture (H, W) of the tag whose frame M (x right, y up, z out of the print) is at X_FM in the flange
-        frame."""
+        """The grey picture (H, W) of the tag at X_FM in the flange frame; M: x right, y up, z out of the print."""
         X_KM = self._X_KF @ X_FM
         found = np.full(self._size, round(255 * SOFT[1]), dtype=np.uint8)
         plate = np.round(self._pixels(X_KM, self._plate_M) * 2**_SUBPIXEL_BITS).astype(np.int32)
@@ -84,9 +83,8 @@ class RenderedFingerCamera(FingerCameraConfig):
     rate_hz: float = 30.0
     latency_s: float = 0.040
     noise_grey: float = 2.0
-    hidden_from_s: float | None = (
-        None  # spatter on the lens: the tag is not visible from this time after the camera started
-    )
+    # spatter on the lens: the tag is not visible from this time after the camera started
+    hidden_from_s: float | None = None
 
     def camera(self) -> FingerCamera:
         """Image size, focal length, frame rate and latency."""
@@ -107,8 +105,10 @@ _NO_IMAGE = Image()
 
 @lru_cache(maxsize=4)
 def _noise_table(sigma: float) -> np.ndarray:
-    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one
-    look-up."""
+    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera.
+
+    A draw is one look-up.
+    """
     return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
 
 
@@ -166,9 +166,8 @@ class StreamingCamera(LeafSystem):
         grey = covered if hidden else self._draw(self._poses.Eval(context))
         pixels = with_noise(grey, self._config.noise_grey, np.random.default_rng([self._seed, stream.count]))
         step = self._plant_period_s
-        taken = (
-            np.ceil(now / step - 1e-6) - 1.0
-        ) * step  # at the time of a tick the plant's outputs still show the previous step
+        # at the time of a tick the plant's outputs still show the previous step
+        taken = (np.ceil(now / step - 1e-6) - 1.0) * step
         frame = Image(stream.count + 1, taken, pixels, exposed_at=now)
         kept = 4 + int(self._config.latency_s * self._config.rate_hz)  # enough frames to cover the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
@@ -197,11 +196,6 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
     def draw(body_poses: list[RigidTransform]) -> Pixels:
         return view.picture(body_poses[plate].InvertAndCompose(body_poses[tip]) @ X_TM)
 
-    camera = build.builder.AddSystem(
-        StreamingCamera(config, int(build.rng.integers(2**31)), world.plant.time_step(), draw)
-    )
-    camera.set_name("finger_camera")
+    camera = StreamingCamera(config, int(build.rng.integers(2**31)), world.plant.time_step(), draw)
+    build.add("finger_camera", camera, *(f"finger_camera.{name}" for name in ("streaming", "image", "capture_time")))
     build.builder.Connect(world.plant.get_body_poses_output_port(), camera.GetInputPort("body_poses"))
-    build.inputs["finger_camera.streaming"] = camera.GetInputPort("streaming")
-    build.outputs["finger_camera.image"] = camera.GetOutputPort("image")
-    build.outputs["finger_camera.capture_time"] = camera.GetOutputPort("capture_time")

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import GeometryId
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
@@ -14,7 +15,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.config import DriverConfig
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
@@ -124,9 +125,8 @@ class RayFan:
         t = hit["t_hit"].numpy().astype(float)
         normal = hit["primitive_normals"].numpy().astype(float)
         number = hit["geometry_ids"].numpy().astype(np.int64)
-        dark = np.array([*self._dark, 1.0])[
-            np.minimum(number, len(self._dark))
-        ]  # a miss is the largest representable number
+        # a miss is the largest representable number
+        dark = np.array([*self._dark, 1.0])[np.minimum(number, len(self._dark))]
         t_ball, normal_ball = self._sphere(start, d)
         nearer = t_ball < t
         t, dark = np.where(nearer, t_ball, t), np.where(nearer, 0.0, dark)
@@ -210,8 +210,9 @@ class ProfilerSensor(LeafSystem):
 
 
 class TouchSensor(LeafSystem):
-    """Detects contact of the torch's tip with the sphere from the plant's contact results; it takes the place of the
-    sphere paper's microcontroller.
+    """Detects contact of the torch's tip with the sphere from the plant's contact results.
+
+    It takes the place of the sphere paper's microcontroller.
 
     .. pydrake_system::
 
@@ -222,9 +223,9 @@ class TouchSensor(LeafSystem):
         - touch
     """
 
-    def __init__(self, pair: TouchPair, plant_period_s: float, period_s: float = 0.004) -> None:
+    def __init__(self, pair: frozenset[GeometryId], plant_period_s: float, period_s: float = 0.004) -> None:
         super().__init__()
-        self._pair, self._step = {pair.tip, pair.ball}, plant_period_s
+        self._pair, self._step = pair, plant_period_s
         self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
         self._touch = self.DeclareAbstractState(AbstractValue.Make(TorchTouch()))
         self.DeclareStateOutputPort("touch", self._touch)
@@ -284,18 +285,10 @@ def ApplyDriverConfig(config: RenderedProfiler, build: StationBuild) -> None:
         raise RuntimeError("the profiler's fixture is not in the simulated world")
     plant, builder = world.plant, build.builder
     flange = plant.GetBodyByName("flange", world.arm).index()
-    sensor = builder.AddSystem(
-        ProfilerSensor(config, fixture, flange, int(build.rng.integers(2**31)), plant.time_step())
-    )
-    sensor.set_name("profiler")
-    touch = builder.AddSystem(TouchSensor(pair, plant.time_step()))
-    touch.set_name("touch_sensor")
-    cheat = builder.AddSystem(CheatTorch(fixture, flange))
-    cheat.set_name("cheat_torch")
+    sensor = ProfilerSensor(config, fixture, flange, int(build.rng.integers(2**31)), plant.time_step())
+    build.add("profiler", sensor, "profiler.trigger", "profiler.profile")
+    touch = build.add("touch_sensor", TouchSensor(pair, plant.time_step()), "torch.touch")
+    cheat = build.add("cheat_torch", CheatTorch(fixture, flange), "cheat.torch")
     for system in (sensor, cheat):
         builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
     builder.Connect(plant.get_contact_results_output_port(), touch.GetInputPort("contact_results"))
-    build.inputs["profiler.trigger"] = sensor.GetInputPort("trigger")
-    build.outputs["profiler.profile"] = sensor.GetOutputPort("profile")
-    build.outputs["torch.touch"] = touch.GetOutputPort("touch")
-    build.outputs["cheat.torch"] = cheat.GetOutputPort("torch")

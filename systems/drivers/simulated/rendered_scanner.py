@@ -209,8 +209,7 @@ class TrueScanner(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class MountedScanner:
-    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and what renders its
-    pictures."""
+    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and its renderer."""
 
     X_LC: RigidTransform
     device: ScannerPreset
@@ -243,8 +242,7 @@ def mount_scanner(config: RenderedScanner, build: StationBuild) -> MountedScanne
         if carrier is not None:
             raise InputError("scanner.knock_s is for a scanner on a stand: write mounted_on: base, or leave it out.")
         parent = add_stand(build.builder, view, config.knock_s, config.knock(X_BC))
-    sensor = build.builder.AddSystem(RgbdSensor(parent, X_BC, colour, camera))
-    sensor.set_name("scanner_depth")
+    sensor = build.builder.AddNamedSystem("scanner_depth", RgbdSensor(parent, X_BC, colour, camera))
     build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.parts = (*build.parts, TrueScanner(preset))
     return MountedScanner(X_BC, preset, sensor)
@@ -256,10 +254,8 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
     """
     mounted = mount_scanner(config, build)
-    scanner = build.builder.AddSystem(DepthSensor(mounted.device, int(build.rng.integers(2**31)), config.exposure_s))
-    scanner.set_name("scanner")
+    scanner = DepthSensor(mounted.device, int(build.rng.integers(2**31)), config.exposure_s)
+    build.add("scanner", scanner, "scanner.trigger", "scanner.scan")
     build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
     build.builder.Connect(mounted.sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
-    build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")
-    build.outputs["scanner.scan"] = scanner.GetOutputPort("scan")
     return mounted.X_LC

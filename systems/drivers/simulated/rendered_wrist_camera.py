@@ -24,8 +24,7 @@ _NEAR_M, _FAR_M = 0.05, 2.0
 
 @dc.dataclass(kw_only=True)
 class RenderedWristCamera(DriverConfig):
-    """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its
-    noise."""
+    """`!RenderedWristCamera`: the camera's nominal pose on the flange, the true pose's deviation, and its noise."""
 
     FOR: ClassVar[tuple[str, ...]] = ("wrist_camera",)
     SIMULATED: ClassVar[bool] = True
@@ -107,14 +106,11 @@ def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
     )
     flange = view.frames[world.plant.GetBodyByName("flange", world.arm).index()]
     depth = DepthRenderCamera(core, DepthRange(_NEAR_M, _FAR_M))
-    sensor = builder.AddSystem(
-        RgbdSensor(flange, build.require(TabletTruth).X_FC, ColorRenderCamera(core, False), depth)
+    sensor = builder.AddNamedSystem(
+        "wrist_rgbd", RgbdSensor(flange, build.require(TabletTruth).X_FC, ColorRenderCamera(core, False), depth)
     )
-    sensor.set_name("wrist_rgbd")
-    camera = builder.AddSystem(WristCamera(config, int(build.rng.integers(2**31))))
-    camera.set_name("wrist_camera")
+    camera = WristCamera(config, int(build.rng.integers(2**31)))
+    build.add("wrist_camera", camera, "wrist_camera.trigger", "wrist_camera.picture")
     builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     builder.Connect(sensor.color_image_output_port(), camera.GetInputPort("color_image"))
     builder.Connect(sensor.depth_image_32F_output_port(), camera.GetInputPort("depth_image"))
-    build.inputs["wrist_camera.trigger"] = camera.GetInputPort("trigger")
-    build.outputs["wrist_camera.picture"] = camera.GetOutputPort("picture")

@@ -29,8 +29,10 @@ class PlacedArm:
 
 
 def place_second_arm(config: SecondArm, off: RigidTransform) -> PlacedArm:
-    """Place the arm with the deviation ``off`` from its nominal pose (rotation in its own frame, translation in the
-    first arm's base)."""
+    """Place the arm with the deviation ``off`` from its nominal pose.
+
+    Its rotation is in the arm's own frame, its translation in the first arm's base.
+    """
     drawn = config.pose()
     X_BD = RigidTransform(drawn.rotation() @ off.rotation(), drawn.translation() + off.translation())
     return PlacedArm(load_arm(config.arm), X_BD, np.deg2rad(config.home_deg))

@@ -13,9 +13,9 @@ from pydrake.systems.framework import BasicVector, Context, State
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import ScannerStream, get_stream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
+from weldcal.systems.drivers.config import check_range
 from weldcal.systems.drivers.simulated.rendered_scanner import (
     DepthSensor,
     MountedScanner,
@@ -180,17 +180,14 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
 
     Returns its true pose in its carrier's frame.
     """
-    if not 1 <= config.exposure_samples <= 16:
-        raise InputError(f"scanner.exposure_samples must be from 1 to 16, and it is {config.exposure_samples}.")
+    check_range("scanner.exposure_samples", config.exposure_samples, 1, 16)
     timing, world = config.stream(), build.require(SimulatedWorld)
     mounted = mount_scanner(config, build)
     seed = int(build.rng.integers(2**31))
-    stream = build.builder.AddSystem(DepthStream(mounted.device, timing, config, seed, world.plant.time_step()))
-    stream.set_name("scanner")
+    stream = DepthStream(mounted.device, timing, config, seed, world.plant.time_step())
+    build.add("scanner", stream, "scanner.streaming", "scanner.stream")
     build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), stream.GetInputPort("depth_image"))
     build.builder.Connect(mounted.sensor.color_image_output_port(), stream.GetInputPort("color_image"))
-    build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
-    build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
     build.outputs["cheat.scanner_capture"] = stream.GetOutputPort("newest_capture")
     _add_static_mode(config, build, mounted)
     build.outputs["cheat.joints"] = world.plant.get_state_output_port(world.arm)
@@ -198,18 +195,18 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
 
 
 def _add_static_mode(config: StreamingScanner, build: StationBuild, mounted: MountedScanner) -> None:
-    """Add the mode that takes a scan per trigger: the device's own errors are those of the stream, its noise is
-    smaller."""
+    """Add the mode that takes a scan per trigger.
+
+    The device's own errors are those of the stream, its noise is smaller.
+    """
     own, at_rest = mounted.device.noise, get_scanner(config.static_preset).noise
     kept = ("scale_error", "gradient_per_m", "warp_m", "device")
     noise = dc.replace(at_rest, **{name: getattr(own, name) for name in kept})
     device = dc.replace(mounted.device, noise=noise)
-    scans = build.builder.AddSystem(DepthSensor(device, int(build.rng.integers(2**31)), config.static_exposure_s))
-    scans.set_name("scanner_at_rest")
+    scans = DepthSensor(device, int(build.rng.integers(2**31)), config.static_exposure_s)
+    build.add("scanner_at_rest", scans, "scanner.trigger", "scanner.scan")
     build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), scans.GetInputPort("depth_image"))
     build.builder.Connect(mounted.sensor.color_image_output_port(), scans.GetInputPort("color_image"))
-    build.inputs["scanner.trigger"] = scans.GetInputPort("trigger")
-    build.outputs["scanner.scan"] = scans.GetOutputPort("scan")
 
 
 class FrameReplay(LeafSystem):

@@ -1,5 +1,7 @@
-"""Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the
-table."""
+"""Adds the tablet job's bodies to the simulated world.
+
+Plate, camera and sprung pen on the flange, tablet on the table.
+"""
 
 import dataclasses as dc
 from dataclasses import dataclass
@@ -128,10 +130,9 @@ def ApplyDriverConfig(config: SimulatedTablet, build: StationBuild) -> None:
     plant = build.require(SimulatedWorld).plant
     pair = {_geometry(plant, "", build, GLASS), _geometry(plant, "pen", build, NIB)}
     px_per_m, X_BT = 1e3 * build.require(TabletConfig).px_per_mm, build.require(TabletTruth).X_BT
-    tablet = build.builder.AddSystem(TabletDigitizer(config, px_per_m, pair, X_BT, int(build.rng.integers(2**31))))
-    tablet.set_name("tablet")
+    tablet = TabletDigitizer(config, px_per_m, pair, X_BT, int(build.rng.integers(2**31)))
+    build.add("tablet", tablet, "digitizer.touch")
     build.builder.Connect(plant.get_contact_results_output_port(), tablet.GetInputPort("contact_results"))
-    build.outputs["digitizer.touch"] = tablet.GetOutputPort("touch")
 
 
 _TEXELS_PER_MM = 8

@@ -14,10 +14,9 @@ from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
-from weldcal.models.errors import InputError
-from weldcal.systems.drivers.config import DriverConfig
+from weldcal.systems.drivers.config import DriverConfig, check_range
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
-from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.drivers.station_build import ARM_PORTS, StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import UrStatus
 
@@ -158,8 +157,9 @@ class SpeedJointServo(LeafSystem):
 
 @compiled()
 def _follow(reference: Array, fault: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
-    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place; whether the arm starts
-    to move.
+    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place.
+
+    Whether the arm starts to move.
 
     ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
     """
@@ -179,23 +179,17 @@ def _follow(reference: Array, fault: Array, measured: Array, command: Array, lim
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     """Add the servo and connect it to the simulated arm."""
-    if not 0.0 <= config.repeatability_mm <= _LARGEST_MM:
-        raise InputError(
-            f"robot.repeatability_mm must be from 0 to {_LARGEST_MM:g}, and it is {config.repeatability_mm:g}."
-        )
+    check_range("robot.repeatability_mm", config.repeatability_mm, 0.0, _LARGEST_MM)
     world = build.require(SimulatedWorld)
     # no draw where it is not needed: the other devices' random numbers stay the same
     seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
-    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed, world.plant.time_step()))
-    servo.set_name("arm_servo")
+    servo = SpeedJointServo(build.arm, config, build.q_start, seed, world.plant.time_step())
+    build.add("arm_servo", servo, *ARM_PORTS)
     build.builder.Connect(world.plant.get_state_output_port(world.arm), servo.GetInputPort("arm_state"))
     if not world.plant.has_sampled_output_ports():
         acceleration = world.plant.get_generalized_acceleration_output_port(world.arm)
         build.builder.Connect(acceleration, servo.GetInputPort("arm_acceleration"))
     build.builder.Connect(servo.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
-    build.inputs["arm.velocity_command"] = servo.GetInputPort("velocity_command")
-    for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"arm.{name}"] = servo.GetOutputPort(name)
 
 
 def draw_true_arm(arm: ArmModel, error_mm: float, q: Array, rng: np.random.Generator) -> ArmModel:
@@ -208,8 +202,7 @@ def draw_true_arm(arm: ArmModel, error_mm: float, q: Array, rng: np.random.Gener
     Raises:
         InputError: the error is negative or larger than 5 mm.
     """
-    if not 0.0 <= error_mm <= _LARGEST_LINK_MM:
-        raise InputError(f"robot.kinematic_error_mm must be from 0 to {_LARGEST_LINK_MM:g}, and it is {error_mm:g}.")
+    check_range("robot.kinematic_error_mm", error_mm, 0.0, _LARGEST_LINK_MM)
     if error_mm == 0.0:
         return arm
     frames = link_frames(arm, q)

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties, Box, ProximityProperties, SceneGraph
+from pydrake.geometry import (
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Box,
+    GeometryId,
+    ProximityProperties,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -38,7 +45,7 @@ from weldcal.systems.bodies.tool import (
     show,
 )
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, add_fixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 
@@ -50,8 +57,7 @@ SERVO_EFFORT = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)  # N m, of that arm: anot
 
 
 def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
-    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints'
-    torques."""
+    """Stiffness (6) N m / rad and damping (6) N m s / rad of joint servos, in proportion to the joints' torques."""
     share = arm.effort_limit / np.array(SERVO_EFFORT)
     return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
@@ -67,15 +73,34 @@ class SimulatedWorld(Message):
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
-    touch_pair: TouchPair | None = None
+    touch_pair: frozenset[GeometryId] | None = None  # whose contact counts as a touch
 
 
 class Fittings(Protocol):
     """Further bodies of a scenario, on the flange and on the table."""
 
     def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
-        """Add them before the plant is finalised; returns the model instance whose springs have their rest position at
-        zero."""
+        """Add them before the plant is finalised.
+
+        Returns the model instance whose springs have their rest position at zero.
+        """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorldSetup:
+    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
+
+    `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
+    `contacts_read`: a device reads the plant's contact results, which are then those of its last step.
+    """
+
+    fittings: Sequence[Fittings] = ()
+    second: PlacedArm | None = None
+    foot: BaseCircle | None = None
+    profiler: ProfilerFixture | None = None
+    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
+    parts: Sequence[object] = ()
+    contacts_read: bool = False
 
 
 def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
@@ -83,8 +108,9 @@ def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: l
 
     Gravity stays on: without any force on an arm at rest, the contact solver has no scale for its convergence test.
     """
-    feed_forward = builder.AddSystem(InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
-    feed_forward.set_name("gravity_compensation")
+    feed_forward = builder.AddNamedSystem(
+        "gravity_compensation", InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation)
+    )
     builder.Connect(plant.get_state_output_port(), feed_forward.get_input_port_estimated_state())
     split = builder.AddSystem(Demultiplexer([plant.num_actuated_dofs(m) for m in models]))
     builder.Connect(feed_forward.get_output_port_generalized_force(), split.get_input_port())
@@ -102,29 +128,23 @@ def build_world(
     table: RigidTransform,
     workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
-    fittings: Sequence[Fittings] = (),
-    profiler: ProfilerFixture | None = None,
-    time_step_s: float = 0.002,
-    second: PlacedArm | None = None,
-    foot: BaseCircle | None = None,
-    surroundings: Surroundings | None = None,
-    contacts_read: bool = False,
+    setup: WorldSetup,
+    surroundings: Surroundings,
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
     Gravity pulls against the arm's `up`. `table` is the pose in B of the table's top, z up.
     A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
     Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
-    `contacts_read`: a device reads the plant's contact results, which are then those of its last step.
-    `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
     """
+    profiler, second, foot = setup.profiler, setup.second, setup.foot
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
-            time_step=time_step_s,
+            time_step=setup.time_step_s,
             contact_model="hydroelastic" if profiler is None else "point",
             # A plant with sampled ports steps in an unrestricted update: at each step Drake would copy the state of the
             # whole Diagram.
-            use_sampled_output_ports=contacts_read,
+            use_sampled_output_ports=setup.contacts_read,
             # With `sap` the tip's rest position would depend on the sliding speed
             discrete_contact_approximation="lagged",
         ),
@@ -148,8 +168,7 @@ def build_world(
         reach = np.abs(workpiece.mesh.transformed(table.inverse() @ X_BP).bounds[:, :2]).max(axis=0)
         length, width = (max(least, 2.0 * float(r) + 0.2) for least, r in zip(TABLE_M, reach, strict=True))
     show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(length, width, 0.04), "table", TABLE)
-    if surroundings is not None:
-        add_surroundings(plant, surroundings)
+    add_surroundings(plant, surroundings)
     if workpiece is not None and X_BP is not None:
         show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
         rigid = ProximityProperties()
@@ -159,7 +178,7 @@ def build_world(
             plant.RegisterCollisionGeometry(
                 world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
             )
-    fitted = [fitting.add(plant, instance) for fitting in fittings]
+    fitted = [fitting.add(plant, instance) for fitting in setup.fittings]
     stiffness, damping = servo_gains(arm)
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
@@ -174,12 +193,12 @@ def build_world(
     moved = [m for m in (instance, tool_instance, second_arm, *fitted) if m is not None]
     compensate_gravity(builder, plant, moved)
     if tool_instance is not None:
-        rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
-        rest.set_name("tip_at_rest")
+        rest = builder.AddNamedSystem("tip_at_rest", ConstantVectorSource(np.zeros(6)))
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
     for k, model in enumerate(fitted):
-        still = builder.AddSystem(ConstantVectorSource(np.zeros(2 * plant.num_actuated_dofs(model))))
-        still.set_name(f"fittings_at_rest_{k}")
+        still = builder.AddNamedSystem(
+            f"fittings_at_rest_{k}", ConstantVectorSource(np.zeros(2 * plant.num_actuated_dofs(model)))
+        )
         builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(model))
     scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
     return SimulatedWorld(
@@ -192,19 +211,3 @@ def build_world(
         second=second_arm,
         touch_pair=touch_pair,
     )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class WorldSetup:
-    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
-
-    `contacts_read`: a device reads the plant's contact results.
-    """
-
-    fittings: Sequence[Fittings] = ()
-    second: PlacedArm | None = None
-    foot: BaseCircle | None = None
-    profiler: ProfilerFixture | None = None
-    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
-    parts: Sequence[object] = ()
-    contacts_read: bool = False

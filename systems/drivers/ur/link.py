@@ -1,5 +1,7 @@
-"""The cell's side of the robot link: starts the worker, shares memory with it without blocking, and ends the
-program."""
+"""The cell's side of the robot link.
+
+Starts the worker, shares memory with it without blocking, and ends the program.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,11 @@ from numpy.typing import NDArray
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
+from weldcal.systems.drivers.ur.robot import WorkerConfig
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.wire.line import stop_program
-from weldcal.systems.drivers.ur.worker import WorkerConfig, WorkerPhase
+from weldcal.systems.drivers.ur.worker import WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
@@ -40,33 +43,19 @@ class StartFailed(RobotRefused):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinkState:
-    """The worker's newest state.
+class LinkState(Published):
+    """The worker's newest state, with the fault as the cell judges it.
 
     Times in s of the host's monotonic clock, except `robot_time` (the controller's clock).
     """
 
-    q: NDArray[np.float64]
-    qd: NDArray[np.float64]
-    robot_time: float
-    sampled_at: float
-    age_s: float
-    fault: Fault
-    fault_time: float
-    sent: int
-    heard: int
-    echo_latency_s: float
-    worst_period_s: float
-    late_periods: int
-    clock_residual_s: float
-    clock_drift: float
-    process_on: bool = False  # process output as reported by the controller
-    arc: bool | None = None  # established; None where the input is not wired
-    detail: float = 0.0  # of the fault
-    robot_mode: int = 7
-    safety_mode: int = 1
-    program_running: bool = True
-    speed_scaling: float = 1.0
+    age_s: float = 0.0  # since the robot took the sample
+    fault: Fault = Fault.NONE
+
+    @property
+    def program_running(self) -> bool:
+        """The guard obeys the cell."""
+        return self.runtime_state == PLAYING and self.fault is Fault.NONE
 
     @property
     def codes(self) -> tuple[float, ...]:
@@ -82,8 +71,10 @@ class LinkState:
 
 @lru_cache(maxsize=64)
 def status_of(codes: tuple[float, ...]) -> UrStatus:
-    """The state of the controller in words, from robot mode, safety mode, running (0 or 1), speed scaling, fault and
-    its detail."""
+    """The controller's state in words.
+
+    The numbers are robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail.
+    """
     robot_mode, safety_mode, running, scaling, code, detail = codes
     fault = Fault(int(code))
     return UrStatus(
@@ -176,8 +167,10 @@ class UrLink:
         self.command(np.zeros(6))
 
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no
-        sample."""
+        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds.
+
+        None where there is no sample.
+        """
         return self._memory.ring.at(host_time)
 
     def robot_time(self) -> float:
@@ -198,7 +191,7 @@ class UrLink:
         if found is None:
             raise RuntimeError("the link has not started")
         now = time.monotonic()
-        fault, detail, fault_time = Fault(found.fault), found.detail, found.fault_time
+        fault, fault_time = Fault(found.fault), found.fault_time
         if fault is Fault.NONE and self._died is None and found.phase != WorkerPhase.ENDED:
             limits = self._config.limits
             quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
@@ -210,30 +203,8 @@ class UrLink:
         paused = found.runtime_state in (PAUSING, PAUSED)
         if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
             self._see_to_the_stop()
-        sampled_at = found.host_time
-        return LinkState(
-            q=found.q,
-            qd=found.qd,
-            robot_time=found.robot_time,
-            sampled_at=sampled_at,
-            age_s=now - sampled_at,
-            fault=fault,
-            fault_time=fault_time,
-            sent=int(found.number),
-            heard=int(found.echo),
-            echo_latency_s=found.echo_latency,
-            worst_period_s=found.worst_period,
-            late_periods=found.late_periods,
-            clock_residual_s=found.clock_residual,
-            clock_drift=found.clock_drift,
-            process_on=found.process_on,
-            arc=None if found.arc < 0 else found.arc > 0,
-            detail=detail,
-            robot_mode=found.robot_mode,
-            safety_mode=found.safety_mode,
-            program_running=found.runtime_state == PLAYING and fault is Fault.NONE,
-            speed_scaling=found.speed_scaling,
-        )
+        judged = vars(found) | {"fault": fault, "fault_time": fault_time}
+        return LinkState(**judged, age_s=now - found.host_time)
 
     def close(self) -> None:
         """Brake, end the program, end the worker, then confirm the stop through the dashboard. May be called twice."""

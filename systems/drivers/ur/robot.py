@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
@@ -13,7 +14,7 @@ from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
 from weldcal.systems.drivers.ur.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
 from weldcal.systems.drivers.ur.set_points import ArcInputs, Level, apart
-from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
+from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, Limits, RobotSample
 from weldcal.systems.drivers.ur.wire.rtde_client import (
     DOUBLES,
     SET_POINTS,
@@ -134,7 +135,8 @@ class Refused(Exception):
 def guard_script(
     upper_registers: bool, output: int | None = None, gas: int | None = None, levels: Sequence[Level] = ()
 ) -> str:
-    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share;
+    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share.
+
     `output` and `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired;
     `levels`: set points.
     """
@@ -154,34 +156,46 @@ def guard_script(
 
 
 def _without(text: str, mark: str) -> str:
-    """The script without the lines of a mark: a controller may refuse a program for the name of a function that it
-    never calls."""
+    """The script without the lines of a mark.
+
+    A controller may refuse a program for the name of a function that it never calls.
+    """
     return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorkerConfig:
+    """The configuration that the cell passes to its worker. `arm` has the robot's own kinematics."""
+
+    host: str
+    arm: ArmModel
+    limits: Limits
+    parent: int
+    rate_hz: float = 250.0
+    upper_registers: bool = True
+    payload_kg: float = 0.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    process_output: int | None = None
+    arc_input: int | None = None
+    arc_fault_input: int | None = None
+    gas_output: int | None = None
+    gas_before_s: float = 0.0
+    gas_after_s: float = 0.0
+    levels: tuple[Level, ...] = ()
+    transport: str = NATIVE
 
 
 class ControllerStream:
     """The stream to and from the controller, the clock map and the newest complete package."""
 
-    def __init__(
-        self,
-        host: str,
-        *,
-        upper: bool,
-        pace: float,
-        arm: ArmModel,
-        output: int | None = None,
-        arc_inputs: ArcInputs | None = None,
-        gas: int | None = None,
-        levels: Sequence[Level] = (),
-        transport: str = NATIVE,
-    ) -> None:
-        self._host, self._levels = host, tuple(levels)
-        base = UPPER_OFFSET if upper else 0
-        self._output, self._arm, self._pace = output, arm, pace
-        self._script = guard_script(upper, output, gas, levels)
+    def __init__(self, config: WorkerConfig) -> None:
+        self._host, self._levels, output, levels = config.host, config.levels, config.process_output, config.levels
+        base = UPPER_OFFSET if config.upper_registers else 0
+        self._output, self._arm, self._pace = output, config.arm, config.limits.pace
+        self._script = guard_script(config.upper_registers, output, config.gas_output, levels)
         self._doubles = DOUBLES + (SET_POINTS if levels else 0)
-        self._arc_inputs = arc_inputs or ArcInputs()
-        self.clock = ClockMap(pace)
+        self._arc_inputs = ArcInputs(config.arc_input, config.arc_fault_input)
+        self.clock = ClockMap(self._pace)
         self._latch = f"output_int_register_{base + 12}"
         # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
         self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
@@ -195,13 +209,13 @@ class ControllerStream:
         ]
         names += [ANALOG_TYPES, *(name for pair in self._points for name in pair)] if levels else []
         try:
-            self._stream = self._connected(transport, names, base)
+            self._stream = self._connected(config.transport, names, base)
         except NotFinite as error:
             raise Refused(Fault.STATE_NOT_FINITE, reported_as(error.output)) from error
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
-        self._switch = None if output is None else self._off_switch(output, gas)
+        self._switch = None if output is None else self._off_switch(output, config.gas_output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
         self._sent: dict[float, float] = {}
@@ -267,8 +281,9 @@ class ControllerStream:
         self._stream.send(command, *arguments, *points)
 
     def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
-        """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the
-        guard waits for a package.
+        """Read until the payload is the one that was set, in a thread.
+
+        The connection's end may take longer than the guard waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
         try:
@@ -336,8 +351,10 @@ class ControllerStream:
         )
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which the process was suspended, as silence of the robot; at most EXCUSED_S in a
-        row."""
+        """Do not count this time, in which the process was suspended, as silence of the robot.
+
+        At most EXCUSED_S in a row.
+        """
         seconds = min(seconds, max(EXCUSED_S - self._excused, 0.0))
         self._excused += seconds
         self._fresh_at += seconds
@@ -354,8 +371,9 @@ class ControllerStream:
             self._first_unheard = min(self._sent.values(), default=now)
 
     def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
-        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process, `armed` the set
-        points. Returns False where the program does not run.
+        """Send one velocity, numbered for the guard's watchdog.
+
+        A negative number enables the process, `armed` the set points. Returns False where the program does not run.
         """
         self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()

@@ -18,7 +18,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
-from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.drivers.station_build import ARM_PORTS, PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.link import StartFailed, UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
@@ -34,6 +34,11 @@ FULL_PACE = 1.0  # a controller's time is real time; only an emulated one has an
 STILL_RAD_S = 1e-9  # rounding of a zero command: in a frame of 2 ms a joint turns 2e-12 rad
 # one period of the commands: a later velocity is replaced by the next one before the robot uses it
 CATCHES_UP_S = 0.004
+OF_WORKER = (
+    *("rate_hz", "payload_kg", "process_output", "arc_input", "arc_fault_input"),
+    *("gas_output", "gas_before_s", "gas_after_s"),
+)
+"""Keys of the scenario that the worker takes as they are."""
 N_OUTPUTS = 8
 
 
@@ -161,7 +166,7 @@ class UrRtdeArm(LeafSystem):
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
-        arc = float(found.arc is None or found.arc)
+        arc = float(found.arc != 0)
         discrete.set_value(self._desired, np.concatenate([desired, qd]))
         discrete.set_value(self._position, found.q)
         discrete.set_value(self._velocity, qd)
@@ -176,9 +181,8 @@ class UrRtdeArm(LeafSystem):
             return EventStatus.DidNothing()  # the robot that is followed waits until the Diagram has caught up with it
         # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
-        moving = (
-            not np.abs(wanted).max() < STILL_RAD_S
-        )  # so that what is no number reaches the worker, which refuses it
+        # so that what is no number reaches the worker, which refuses it
+        moving = not np.abs(wanted).max() < STILL_RAD_S
         self._clock.velocity_leaves(late_s, moving)
         self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process)
         return EventStatus.Succeeded()
@@ -216,8 +220,9 @@ def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> t
 
 
 def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why: str) -> tuple[UrLink, str]:
-    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native
-    follows.
+    """The link over this transport, and why over this one.
+
+    Where `auto` took ur_rtde and it does not start, native follows.
 
     Raises:
         RobotRefused: the link does not start.
@@ -233,8 +238,9 @@ def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
-    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not
-    move.
+    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard.
+
+    The arm does not move.
 
     Raises:
         InputError: the scenario names no host, or a pace other than 1 or lockstep for a real robot.
@@ -288,17 +294,10 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         config.host,
         arm,
         config.limits(arm),
-        rate_hz=config.rate_hz,
         upper_registers=report.upper_registers,
-        payload_kg=config.payload_kg,
         payload_cog_m=(x, y, z),
-        process_output=config.process_output,
-        arc_input=config.arc_input,
-        arc_fault_input=config.arc_fault_input,
-        gas_output=config.gas_output,
-        gas_before_s=config.gas_before_s,
-        gas_after_s=config.gas_after_s,
         levels=levels,
+        **{name: getattr(config, name) for name in OF_WORKER},
     )
     link, why = start_link(start, config, transport, why)
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
@@ -309,14 +308,9 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     """Add the arm with its link; the simulated arm follows the real one, for the rendered sensors."""
     if build.robot is None or not isinstance(build.robot.handle, UrLink) or build.robot.clock is None:
         raise RuntimeError("the robot was not prepared")
-    arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, build.robot.clock))
-    arm.set_name("arm_link")
+    arm = UrRtdeArm(build.arm, build.robot.handle, build.robot.clock)
+    process = () if config.process_output is None else ("arm.process_on",)
+    arc = () if config.arc_input is None else ("arm.arc_established",)
+    build.add("arm_link", arm, *ARM_PORTS, *process, *arc)
     if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
-    build.inputs["arm.velocity_command"] = arm.GetInputPort("velocity_command")
-    if config.process_output is not None:
-        build.inputs["arm.process_on"] = arm.GetInputPort("process_on")
-    if config.arc_input is not None:
-        build.outputs["arm.arc_established"] = arm.GetOutputPort("arc_established")
-    for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"arm.{name}"] = arm.GetOutputPort(name)

@@ -35,8 +35,10 @@ class ArcInputs:
 
 @dataclass
 class Gas:
-    """The gas valve's sequence, s of the controller's time: `before_s` of gas, then the torch, then `after_s` of
-    gas."""
+    """The gas valve's sequence, s of the controller's time.
+
+    `before_s` of gas, then the torch, then `after_s` of gas.
+    """
 
     before_s: float = 0.0
     after_s: float = 0.0
@@ -44,8 +46,7 @@ class Gas:
     _needed_at: float = float("-inf")
 
     def step(self, now: float, wanted: bool) -> tuple[bool, bool]:
-        """Whether the valve is open, and whether the torch may be on, at `now` while the cell wants the torch or
-        not."""
+        """Whether the valve is open, and whether the torch may be on, at `now`; `wanted`: the cell wants the torch."""
         if wanted:
             self._opened_at = now if self._opened_at is None else self._opened_at
             self._needed_at = now
@@ -67,8 +68,7 @@ DOMAINS = 2  # bit of output 0 in analog_io_types; the inputs' come before it
 
 @dc.dataclass
 class AnalogSetPoint:
-    """A set point of the power source at a standard analog output of the controller, and how the power source reads
-    it."""
+    """A set point of the power source at a standard analog output, and how the power source reads it."""
 
     output: int = 0  # standard analog output, 0 or 1
     unit: str = VOLT  # of the output: V (0 to 10) or mA (4 to 20)
@@ -99,8 +99,7 @@ class AnalogSetPoint:
 
 @dc.dataclass(frozen=True)
 class Level:
-    """A standard analog output, whether its range is 0 to 10 V or 4 to 20 mA, and the share of its range that is
-    wanted."""
+    """A standard analog output, whether its range is 0 to 10 V or 4 to 20 mA, and the wanted share of it."""
 
     output: int
     volts: bool
@@ -166,8 +165,9 @@ ANALOG = (
 
 
 class OffSwitch:
-    """Turns the torch's output off and its analog outputs (`levels`) to zero; only the guard script turns it on,
-    because it detects a lost client.
+    """Turns the torch's output off and its analog outputs (`levels`) to zero.
+
+    Only the guard script turns it on, because it detects a lost client.
 
     The connection is opened at the start and held, so that turning off takes one small package.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,10 @@ ARC_ENDS_S, ARC_ON_S = 1.0, 0.010
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 FOLLOWING_PATIENCE_S = 30.0  # where the cell waits for the controller too: no time of the host decides
 COMMAND_S, BLIND_COMMANDS = 0.004, 25  # period of the cell's commands, of its time; 0.1 s without a state
+
+
+_SILENCES = ("stale_s", "stale_process_s", "late_s", "lost_s", "deaf_s", "behind_s")
+"""The limits of how long host or controller may be silent."""
 
 
 class Action(IntEnum):
@@ -95,32 +100,13 @@ class Limits:
 
     def slowed(self, pace: float) -> Limits:
         """The same limits where the controller runs at `pace` seconds per host second."""
-        return replace(
-            self,
-            stale_s=self.stale_s / pace,
-            stale_process_s=self.stale_process_s / pace,
-            late_s=self.late_s / pace,
-            lost_s=self.lost_s / pace,
-            deaf_s=self.deaf_s / pace,
-            behind_s=self.behind_s / pace,
-            behind_for_s=self.behind_for_s / pace,
-            pace=pace,
-        )
+        times: dict[str, Any] = {name: getattr(self, name) / pace for name in (*_SILENCES, "behind_for_s")}
+        return replace(self, pace=pace, **times)
 
     def in_lockstep(self, patience_s: float = PATIENCE_S, held_s: float = HELD_S) -> Limits:
-        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no
-        stop."""
-        return replace(
-            self,
-            stale_s=max(self.stale_s, patience_s),
-            stale_process_s=max(self.stale_process_s, patience_s),
-            late_s=max(self.late_s, patience_s),
-            lost_s=max(self.lost_s, patience_s),
-            deaf_s=max(self.deaf_s, patience_s),
-            behind_s=max(self.behind_s, patience_s),
-            jump_s=max(self.jump_s, patience_s),
-            hold_s=held_s / self.pace,
-        )
+        """The limits for an emulated controller in lockstep: the arm waits while this computer is late."""
+        times: dict[str, Any] = {name: max(getattr(self, name), patience_s) for name in (*_SILENCES, "jump_s")}
+        return replace(self, hold_s=held_s / self.pace, **times)
 
     def following(self) -> Limits:
         """The limits for an emulated controller in lockstep that the cell follows: no time of the host decides."""
@@ -308,8 +294,10 @@ class Supervisor:
         return Fault.NONE, 0.0
 
     def _set_points(self, robot: RobotSample) -> float | None:
-        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it
-        should."""
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package.
+
+        None: as it should.
+        """
         wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
         if not wrong:
             self._apart_since = None
@@ -318,8 +306,10 @@ class Supervisor:
         return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
-        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the
-        torch."""
+        """Whether an arc is reported that nothing asks for.
+
+        The input sticks or is noisy, or somebody else burns the torch.
+        """
         if robot.arc is None or robot.process_on is None:
             return False
         if robot.process_asked or robot.process_on:

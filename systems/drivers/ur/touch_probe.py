@@ -1,5 +1,7 @@
-"""Touch probe at a digital input of a UR controller: `!UrTouchProbe` reads every RTDE sample, so that a touch has the
-joints of its sample."""
+"""Touch probe at a digital input of a UR controller.
+
+`!UrTouchProbe` reads every RTDE sample, so that a touch has the joints of its sample.
+"""
 
 import dataclasses as dc
 from collections import deque
@@ -227,6 +229,4 @@ def ApplyDriverConfig(config: UrTouchProbe, build: StationBuild) -> None:
     config.check()
     probe = ProbeInput(config, cell_time(build))
     watch(build, probe, "touch_probe")
-    system = build.builder.AddSystem(UrTouchProbeInput(probe))
-    system.set_name("touch_probe")
-    build.outputs["torch.touch"] = system.GetOutputPort("touch")
+    build.add("touch_probe", UrTouchProbeInput(probe), "torch.touch")

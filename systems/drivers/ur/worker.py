@@ -11,27 +11,24 @@ import pickle
 import signal
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.robot import ControllerStream, Refused
-from weldcal.systems.drivers.ur.set_points import ArcInputs, Gas, Level, SetPoints, apart
+from weldcal.systems.drivers.ur.robot import ControllerStream, Refused, WorkerConfig
+from weldcal.systems.drivers.ur.set_points import Gas, SetPoints, apart
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
     STOPPING,
     Action,
     Decision,
-    Limits,
     RobotSample,
     Supervisor,
     VelocityCommand,
 )
-from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import take_priority
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
@@ -76,28 +73,6 @@ class WorkerPhase(IntEnum):
     OBEYING = 1
     STOPPED = 2  # nothing is sent any more; the state is still read
     ENDED = 3
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class WorkerConfig:
-    """The configuration that the cell passes to its worker. `arm` has the robot's own kinematics."""
-
-    host: str
-    arm: ArmModel
-    limits: Limits
-    parent: int
-    rate_hz: float = 250.0
-    upper_registers: bool = True
-    payload_kg: float = 0.0
-    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    process_output: int | None = None
-    arc_input: int | None = None
-    arc_fault_input: int | None = None
-    gas_output: int | None = None
-    gas_before_s: float = 0.0
-    gas_after_s: float = 0.0
-    levels: tuple[Level, ...] = ()
-    transport: str = NATIVE
 
 
 class Worker:
@@ -194,8 +169,10 @@ class Worker:
             self._gas_on = on
 
     def _scaled(self, command: VelocityCommand, now: float, sample: RobotSample) -> VelocityCommand:
-        """The command with the factor that slows the arm while command or state is late, but not under a burning torch,
-        which goes out first."""
+        """The command with the factor that slows the arm while command or state is late.
+
+        Not under a burning torch, which goes out first.
+        """
         factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
         kept = command.process or self._config.limits.waits
         return command if kept else replace(command, scale=factor)
@@ -233,8 +210,7 @@ class Worker:
             self._phase = WorkerPhase.STOPPED
 
     def _await_the_end(self, robot: ControllerStream, period: float) -> None:
-        """Wait until the controller says that the program has ended, so that nothing of it runs on after this
-        process."""
+        """Wait until the controller's program has ended, so that nothing of it runs on after this process."""
         until = time.monotonic() + ENDS_S / self._config.limits.pace
         while (now := time.monotonic()) < until and robot.sample(now).runtime_state in (PLAYING, STOPPING):
             time.sleep(period)
@@ -289,17 +265,7 @@ def main() -> None:
     take_priority()
     worker = Worker(config, memory)
     try:
-        robot = ControllerStream(
-            config.host,
-            upper=config.upper_registers,
-            pace=config.limits.pace,
-            arm=config.arm,
-            output=config.process_output,
-            arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
-            gas=config.gas_output,
-            levels=config.levels,
-            transport=config.transport,
-        )
+        robot = ControllerStream(config)
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
     except Refused as refused:

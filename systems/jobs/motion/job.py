@@ -1,5 +1,4 @@
-"""The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a
-cube."""
+"""The motion job: calibrate a streaming scanner and its clock, or watch it, while the flange moves in a cube."""
 
 import dataclasses as dc
 from pathlib import Path
@@ -13,6 +12,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import check_range
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.motion.procedure import (
@@ -29,7 +29,7 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.motion.buffers import FrameQueue
 from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
-from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.motion.spine import Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -59,16 +59,11 @@ def check_motion(job: MotionJob) -> None:
     """Check the part's numbers. Raises InputError: one sentence that says what to change."""
     if len(job.centre_m) != 3 or not np.isfinite(job.centre_m).all():
         raise InputError("motion.centre_m must be three numbers, in metres.")
-    if not 20.0 <= job.edge_mm <= 1000.0:
-        raise InputError(f"motion.edge_mm must be from 20 to 1000, and it is {job.edge_mm:g}.")
-    if not 0.0 <= job.lean_deg <= 30.0:
-        raise InputError(f"motion.lean_deg must be from 0 to 30, and it is {job.lean_deg:g}.")
-    if not LEAST_FRAMES <= job.frames <= MOST_FRAMES:
-        raise InputError(f"motion.frames must be from {LEAST_FRAMES} to {MOST_FRAMES}, and it is {job.frames}.")
-    if not 0.01 <= job.speed_m_s <= 1.0:
-        raise InputError(f"motion.speed_m_s must be from 0.01 to 1, and it is {job.speed_m_s:g}.")
-    if not 1 <= job.queue <= 8:
-        raise InputError(f"motion.queue must be from 1 to 8, and it is {job.queue}.")
+    check_range("motion.edge_mm", job.edge_mm, 20.0, 1000.0)
+    check_range("motion.lean_deg", job.lean_deg, 0.0, 30.0)
+    check_range("motion.frames", job.frames, LEAST_FRAMES, MOST_FRAMES)
+    check_range("motion.speed_m_s", job.speed_m_s, 0.01, 1.0)
+    check_range("motion.queue", job.queue, 1, 8)
 
 
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
@@ -77,8 +72,7 @@ _TRIES = 40  # leans drawn for a corner
 
 @dc.dataclass(frozen=True, eq=False)
 class MotionPlanned:
-    """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched,
-    if anything."""
+    """Joints (6,) rad of the corners, the scanner's delay (s) by its data sheet, and what is watched, if anything."""
 
     corners: tuple[Array, ...]
     q_home: Array
@@ -99,8 +93,6 @@ class AddedMotion(AddedJob):
     queue: FrameQueue
     recorder: MotionRecorder | None
     frames: int
-    ports: JobPorts
-    maximum_time_s: float
 
     def record(self, root: Context) -> MotionRecord:
         """What was collected so far."""
@@ -116,7 +108,10 @@ class AddedMotion(AddedJob):
 
     def drift(self, root: Context) -> DriftStatus:
         """What the monitor has found so far."""
-        return DriftStatus() if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
+        if self.monitor is None:
+            return DriftStatus()
+        status: DriftStatus = self.value(self.monitor.GetOutputPort("drift"), root)
+        return status
 
     def counts(self, root: Context) -> tuple[int, int]:
         """Frames that were taken from the queue, and frames that were dropped."""
@@ -206,9 +201,7 @@ class MotionCalibrationJob(Job[MotionPlanned]):
             position_measured=spine.arm.position,
             sample_time=wiring.out(f"{FIRST}.sample_time"),
         )
-        wiring.connect(
-            procedure, settled_goal=spine.arm.settled_goal, robot_status=spine.arm.status, record=record, hold=spine.end
-        )
+        spine.serve(procedure, record=record)
         calibrator, monitor = None, None
         if watched is None:
             calibrator = wiring.add("motion_calibrator", MotionCalibrator(station.arm, station.background))
@@ -233,7 +226,6 @@ class MotionCalibrationJob(Job[MotionPlanned]):
             shown["calibration"] = calibrator.GetOutputPort("calibration")
         if monitor is not None:
             shown["drift"] = monitor.GetOutputPort("drift")
-        ports = JobPorts(commands=(procedure.GetOutputPort("job"),), state=state, logged=logged, shown=shown)
         return AddedMotion(
             plan=plan,
             X_FR=X_FR,
@@ -244,7 +236,7 @@ class MotionCalibrationJob(Job[MotionPlanned]):
             queue=queue,
             recorder=recorder,
             frames=job.frames,
-            ports=ports,
+            ports=procedure.ports(logged=logged, shown=shown),
             maximum_time_s=maximum_time_s,
         )
 
@@ -252,8 +244,9 @@ class MotionCalibrationJob(Job[MotionPlanned]):
 def plan_corners(
     scenario: Scenario, station: Station, job: MotionJob, q_home: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Joint angles (6,) rad that bring the feature to the cube's corners, leaning another way at each, with free moves
-    between all of them.
+    """Joints (6,) rad that bring the feature to the cube's corners, with free moves between all of them.
+
+    The feature leans another way at each corner.
 
     Raises:
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
@@ -283,8 +276,10 @@ def plan_corners(
 def facing(
     p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel, X_FR: RigidTransform | None = None
 ) -> RotationMatrix:
-    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m, turned about its
-    axis as near to that at home as can be."""
+    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m.
+
+    It is turned about its axis as near to that at home as can be.
+    """
     z = X_BC.translation() - p
     z = z / np.linalg.norm(z)
     x_home = (forward_kinematics(arm, q_home) @ (X_FR or RigidTransform())).rotation().matrix()[:, 0]

@@ -75,8 +75,9 @@ class MotionInputs(Inputs):
 
 
 class MotionProcedure(Procedure[MotionState, MotionInputs]):
-    """Runs the procedure; a robot fault, a goal that is not reached, or a scanner that shows nothing holds it with a
-    reason.
+    """Runs the procedure.
+
+    A robot fault, a goal that is not reached, or a scanner that shows nothing holds it with a reason.
 
     .. pydrake_system::
 

@@ -22,8 +22,7 @@ CARRIED = {
 
 @dc.dataclass
 class SecondArm:
-    """The nominal pose of a co-manipulation's second robot, and the deviation of its true pose (from the run's
-    seed)."""
+    """The nominal pose of a co-manipulation's second robot, and the true pose's deviation (from the run's seed)."""
 
     arm: str = "ur10e"
     xyz_m: list[float] = dc.field(default_factory=lambda: [1.5, 0.0, 0.0])  # X_BD, its base in the first arm's base
@@ -39,8 +38,7 @@ class SecondArm:
 
 @dc.dataclass
 class MountingJob:
-    """A calibration with a circle of the robot as its target: the flange, the base circle, or the flange of a second
-    arm."""
+    """A calibration with a circle of the robot as its target: flange, base circle, or a second arm's flange."""
 
     target_known: bool = True  # the circle's pose is known from the drawing; false: it is estimated too
     second_arm: SecondArm | None = None

@@ -46,7 +46,7 @@ from weldcal.systems.jobs.mounting.procedure import (
 )
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.buffers import PoseHistory
-from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.motion.spine import Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.parts import surroundings_of
@@ -67,8 +67,7 @@ class MountingFitConfig:
 
 
 class MountingCalibrator(BackgroundSystem):
-    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all
-    observations.
+    """Fits the circle in each scan near its prediction, and solves the mounting's equation with all observations.
 
     .. pydrake_system::
 
@@ -156,8 +155,10 @@ def digest(
 def next_best(
     belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
-    point most; None where all were visited."""
+    """The unvisited planned pose that reduces the expected error at the work point most.
+
+    All are reachable, visible and clear; None where all were visited.
+    """
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None
@@ -187,8 +188,6 @@ class AddedMounting(AddedJob):
     procedure: MountingProcedure
     calibrator: MountingCalibrator
     truth: dict[str, RigidTransform]
-    ports: JobPorts
-    maximum_time_s: float
 
     def status(self, root: Context) -> MountingStatus:
         """The present result of the calibration."""
@@ -255,19 +254,14 @@ class MountingCalibrationJob(Job[MountingPlanned]):
         calibrator = wiring.add(
             "mounting_calibrator", MountingCalibrator(scene, fit, plan.poses, wiring.station.background)
         )
-        state = procedure.GetOutputPort("state")
-        wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=state)
-        wiring.connect(
-            procedure, status=calibrator.GetOutputPort("status"), hold=spine.end, position_measured=spine.arm.position
-        )
+        wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=procedure.GetOutputPort("state"))
+        spine.serve(procedure, status=calibrator.GetOutputPort("status"))
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
-        for arm, suffix in zip(spine.arms, ("", "_2"), strict=False):
-            wiring.connect(calibrator, **{f"history{suffix}": arm.history})
-            wiring.connect(
-                procedure, **{f"settled_goal{suffix}": arm.settled_goal, f"robot_status{suffix}": arm.status}
-            )
+        wiring.connect(calibrator, history=spine.arm.history)
+        for second in spine.arms[1:]:
+            wiring.connect(calibrator, history_2=second.history)
+            wiring.connect(procedure, settled_goal_2=second.settled_goal, robot_status_2=second.status)
         shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
-        commands = tuple(procedure.GetOutputPort(name) for name in ("job", "job_2"))[: len(spine.arms)]
         return AddedMounting(
             scene=scene,
             plan=plan.poses,
@@ -275,14 +269,16 @@ class MountingCalibrationJob(Job[MountingPlanned]):
             procedure=procedure,
             calibrator=calibrator,
             truth=true_poses(scene, wiring.station),
-            ports=JobPorts(commands=commands, state=state, shown=shown),
+            ports=procedure.ports(len(spine.arms), shown=shown),
             maximum_time_s=maximum_time_s,
         )
 
 
 def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """The scene as known before the first scan, from drawings and rough measurements; and the dimensions of the
-    circle."""
+    """The scene as known before the first scan, from drawings and rough measurements.
+
+    And the dimensions of the circle.
+    """
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")

@@ -1,5 +1,4 @@
-"""MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns
-home."""
+"""Visit the planned poses with one arm or two, scan at each, hold out some scans, and return home."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -43,8 +42,10 @@ class HeldOutScan:
 
 @dataclass(frozen=True)
 class NextBest:
-    """A pose to add: joints (6,) rad, X_BF of the first arm, and the predicted sigma (3-D, m) of a scanned point
-    without and with it."""
+    """A pose to add: joints (6,) rad, X_BF of the first arm, and the sigma of a scanned point without and with it.
+
+    The sigma is 3-D, predicted, in m.
+    """
 
     q: Array
     q_2: Array | None

@@ -1,5 +1,7 @@
-"""Configuration of the profiler job: nominal torch, straightedge and sphere, their deviations, and the stages in
-order."""
+"""Configuration of the profiler job.
+
+Nominal torch, straightedge and sphere, their deviations, and the stages in order.
+"""
 
 import dataclasses as dc
 
@@ -79,8 +81,10 @@ class SeamStage:
 
 @dc.dataclass(kw_only=True)
 class ProfilerJob:
-    """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere
-    stage."""
+    """The stages of the job: edge, sphere and seam in this order.
+
+    The seam stage uses the result of the sphere stage.
+    """
 
     stages: list[str] = dc.field(default_factory=lambda: ["edge", "sphere", "seam"])
     torch: Torch = dc.field(default_factory=Torch)
@@ -89,9 +93,8 @@ class ProfilerJob:
     edge: EdgeStage = dc.field(default_factory=EdgeStage)
     sphere: SphereStage = dc.field(default_factory=SphereStage)
     seam: SeamStage = dc.field(default_factory=SeamStage)
-    robot_sigma_mm: float = (
-        0.06  # per axis: error of the flange position that the controller reports, drawn at each pose
-    )
+    # per axis: error of the flange position that the controller reports, drawn at each pose
+    robot_sigma_mm: float = 0.06
     clearance_mm: float = 6.0  # nominal distance between torch or profiler and the scanned object
     near_mm: float = 72.0  # the depth range of the calibration
     far_mm: float = 105.0

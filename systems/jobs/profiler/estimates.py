@@ -9,7 +9,6 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
-from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.arc import find_arc
@@ -44,21 +43,24 @@ class TakenProfile(Message):
 
 @dataclass(frozen=True, eq=False)
 class EdgeFound(Message):
-    """X_FS from the edge; scans without an edge; held-out scans: distance from the edge (n,) mm, whitened residuals (n,
-    2)."""
+    """X_FS from the edge; scans without an edge.
+
+    Held-out scans: distance from the edge (n,) mm.
+    """
 
     estimate: EdgeEstimate
     poses: FlangePoses
     points: Array
     lost: int
     held_out_mm: Array
-    held_out_sigmas: Array
 
 
 @dataclass(frozen=True, eq=False)
 class SphereFound(Message):
-    """X_FS and the tip from the sphere; the selected model; held-out scans: rms distance (n,) mm of points from the
-    sphere."""
+    """X_FS and the tip from the sphere.
+
+    The selected model; held-out scans: rms distance (n,) mm of points from the sphere.
+    """
 
     estimate: SphereEstimate
     data: SphereData
@@ -124,15 +126,11 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     poses, points = flange_poses(arm, seen["scan"][0]), np.array(seen["scan"][1])
     e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)
     others = flange_poses(arm, seen["held_out"][0])
-    state = EdgeState(e.rotation, e.translation, e.point, e.direction)
-    expected, J, by_robot = predicted(state, others)
     held_out = np.array(seen["held_out"][1]).reshape(-1, 2)
-    off = held_out - expected
-    r, _ = whitened(measurement_covariance(by_robot, robot, sigmas), off, J)
     at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, held_out)) + others.translation
     away = at - e.point
     away -= np.outer(away @ e.direction, e.direction)
-    return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
+    return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1))
 
 
 def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:
@@ -144,8 +142,7 @@ def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:
 
 
 def _one_background(points: Array, behind_m: float) -> Array:
-    """The profile with all samples far behind its nearest face set to one depth, so that post and table have no
-    edges."""
+    """The profile with all samples far behind its nearest face at one depth: post and table have no edges."""
     p = points[np.isfinite(points).all(axis=1)]
     if not len(p):
         return p
@@ -211,8 +208,10 @@ def find_sphere(
 
 
 def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate) -> tuple[Model, SphereEstimate]:
-    """Select the rigid model, or the affine one where it predicts held-out scans better by more than 2 %; with its
-    estimate."""
+    """Select the model, rigid or affine, with its estimate.
+
+    The affine one is taken where it predicts held-out scans better by more than 2 %.
+    """
     names: tuple[Model, ...] = ("rigid", "affine")
     estimates = {name: sphere_joint(data, name, sigmas, rigid) for name in names}
     errors = {}
@@ -230,8 +229,9 @@ def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate)
 def find_seam(
     arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[TakenProfile, ...], every_m: float
 ) -> SeamFound:
-    """Measure the groove's root in B with the calibration: points of all passes, merged along the nominal seam and
-    smoothed.
+    """Measure the groove's root in B with the calibration.
+
+    Points of all passes, merged along the nominal seam and smoothed.
 
     Points far from their neighbours are rejected.
 
@@ -274,8 +274,10 @@ def _means(p: Array, place: NDArray[np.int_]) -> Array:
 
 
 def pose_sigmas(error: RigidTransform, covariance: Array) -> tuple[Array, float]:
-    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction: each of its six parts, and w^T C^-1 w
-    of all."""
+    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction.
+
+    Each of its six parts, and w^T C^-1 w of all.
+    """
     angle = error.rotation().ToAngleAxis()
     e = np.concatenate([angle.angle() * np.asarray(angle.axis()), error.translation()])
     return e / np.sqrt(np.diag(covariance)), float(e @ np.linalg.solve(covariance, e))

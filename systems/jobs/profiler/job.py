@@ -28,7 +28,7 @@ from weldcal.systems.jobs.profiler.plan import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure, ProfilerState
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand
-from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -65,14 +65,12 @@ class RobotError(LeafSystem):
         output.SetFromVector(q + np.linalg.solve(jacobian(self._arm, q), np.concatenate([np.zeros(3), shift])))
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedProfilerJob(AddedJob):
     """The systems of the job."""
 
     job: ProfilerJob
     procedure: ProfilerProcedure
-    ports: JobPorts
-    maximum_time_s: float
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
@@ -143,26 +141,13 @@ class Profiler(Job[PlanningContext]):
                 move_timeout_s=MOVE_TIMEOUT_S / wiring.scenario.job.speed_factor,
             ),
         )
-        wiring.connect(
-            procedure,
-            position=spine.arm.position,
-            history=spine.arm.history,
-            settled_goal=spine.arm.settled_goal,
-            robot_status=spine.arm.status,
-            profile=wiring.out("profiler.profile"),
-            hold=spine.end,
-        )
+        spine.serve(procedure, profile=wiring.out("profiler.profile"))
         known = wiring.station.diagram.HasOutputPort
         if known("torch.touch"):
             wiring.connect(procedure, touch=wiring.out("torch.touch"))
         wiring.feed("profiler.trigger", procedure.GetOutputPort("trigger"))
-        ports = JobPorts(
-            commands=(procedure.GetOutputPort("job"),),
-            state=procedure.GetOutputPort("state"),
-            velocity=procedure.GetOutputPort("creep"),
-            logged={"torch": wiring.out("cheat.torch")} if known("cheat.torch") else {},
-        )
-        return AddedProfilerJob(plan.job, procedure, ports, plan.job.maximum_time_s)
+        ports = procedure.ports(logged={"torch": wiring.out("cheat.torch")} if known("cheat.torch") else {})
+        return AddedProfilerJob(job=plan.job, procedure=procedure, ports=ports, maximum_time_s=plan.job.maximum_time_s)
 
 
 def planning_context(scenario: Scenario, station: Station) -> PlanningContext:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -41,8 +41,10 @@ FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig i
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanningContext:
-    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at
-    X_BP."""
+    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B.
+
+    The nominal workpiece at X_BP.
+    """
 
     arm: ArmModel
     job: ProfilerJob
@@ -91,10 +93,6 @@ class PlanningContext:
             gaps.append(_to_box(p, self.X_BP, [-0.5 * x, -0.5 * y, -z], [0.5 * x, 0.5 * y, 0.0]))
         return float((np.min(gaps, axis=0) - radii).min())
 
-    def joints(self, X_BF: RigidTransform, q_near: Array) -> Array | None:
-        """The inverse kinematics solution nearest to `q_near`; None: out of reach."""
-        return nearest_solution(self.arm, X_BF, q_near)
-
     def clear_way(self, q_a: Array, q_b: Array) -> bool:
         """Whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
         if not self._keeps_gap(q_a, q_b, 0.5e-3 * self.job.clearance_mm):
@@ -105,8 +103,9 @@ class PlanningContext:
         return lowest > self.table_z_m and gap > 0.0
 
     def _keeps_gap(self, q_a: Array, q_b: Array, least_m: float) -> bool:
-        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space; from each checked
-        configuration on by no more than what they have left there.
+        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space.
+
+        From each checked configuration on by no more than what they have left there.
         """
         n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
         rig, _ = rig_points(self.p_FTip, self.X_FS)
@@ -129,15 +128,14 @@ class PlanningContext:
             X = RigidTransform(np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]]))
             if self.gap(X) < 1e-3 * self.job.clearance_mm:
                 continue
-            found = self.joints(X, self.q_home)
+            found = nearest_solution(self.arm, X, self.q_home)
             if found is not None:
                 q.append(found)
                 which.append(k)
         return np.array(q).reshape(-1, 6), np.array(which, dtype=np.intp)
 
     def route(self, q_from: Array, goals: Array) -> list[tuple[Array, int]]:
-        """A route through all goals (n, 6), each time to the nearest remaining one: (joints, goal's index or -1 for
-        home).
+        """A route through all goals (n, 6), each time to the nearest one left: (joints, goal's index or -1: home).
 
         Raises:
             InputError: a goal has no clear move, not even from home.
@@ -157,10 +155,6 @@ class PlanningContext:
                 "Too many of the profiler's poses have no clear move: place the objects farther apart in profiler_job."
             )
         return way
-
-    def known(self, **changes: object) -> PlanningContext:
-        """A copy with updated values."""
-        return replace(self, **changes)  # type: ignore[arg-type]
 
 
 def _to_box(p: Array, X: RigidTransform, low: list[float], high: list[float]) -> Array:
@@ -233,8 +227,9 @@ class Goal(Message):
 
 
 def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
-    """Plan the scans of the straightedge: those that minimise the predicted covariance, and held-out ones among the
-    rest.
+    """Plan the scans of the straightedge.
+
+    Those that minimise the predicted covariance, and held-out ones among the rest.
 
     Raises:
         InputError: too few poses are reachable and clear.
@@ -282,8 +277,9 @@ def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: Sph
 
 
 def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Goal]:
-    """Plan touches at points spread over the sphere's upper part, with a different inclination and rotation of the
-    torch at each.
+    """Plan touches at points spread over the sphere's upper part.
+
+    The torch has a different inclination and rotation at each.
 
     Raises:
         InputError: too few of them can be reached.
@@ -302,7 +298,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
             continue
         tip = planning.center + (planning.radius_m + 1e-3 * stage.gap_mm) * n
         X = RigidTransform(R, tip - R.multiply(planning.p_FTip))
-        found = planning.joints(X, planning.q_home)
+        found = nearest_solution(planning.arm, X, planning.q_home)
         if found is not None and planning.gap(X) > 0.5e-3 * stage.gap_mm and _descends(planning, found, -n):
             q.append(found)
             normals.append(n)
@@ -317,8 +313,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
 
 
 def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
-    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to the deepest place of a
-    touch."""
+    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to a touch's deepest place."""
     stage, X_FP = planning.job.sphere, RigidTransform(planning.p_FTip)
     way = 1e-3 * (stage.gap_mm + stage.deepest_mm) * way
     X_BP = forward_kinematics(planning.arm, q) @ X_FP
@@ -330,8 +325,7 @@ def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
 
 
 def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
-    """Plan the profiler's passes along the nominal seam, perpendicular to the plate, with the laser line across the
-    groove."""
+    """Plan the profiler's passes along the nominal seam, square to the plate, the laser line across the groove."""
     assert planning.cad is not None
     assert planning.X_BP is not None
     stage = planning.job.seam
@@ -418,7 +412,7 @@ def _along(
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
-    first = planning.joints(flange[0], planning.q_home)
+    first = nearest_solution(planning.arm, flange[0], planning.q_home)
     if first is None:
         raise InputError("The arm cannot reach the seam at its nominal pose: move the workpiece nearer.")
     X_FP = RigidTransform(planning.p_FTip)
@@ -432,7 +426,7 @@ def _along(
     )
     joints = check_path(planning.arm, first, [motion])[0].q
     raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]
-    above = planning.joints(raised, joints[0])
+    above = nearest_solution(planning.arm, raised, joints[0])
     ways = [] if above is None else [Goal("via", above)]
     if above is not None and not planning.clear_way(q_from, above):
         ways = [Goal("via", planning.q_home), *ways]

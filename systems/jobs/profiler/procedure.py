@@ -1,5 +1,4 @@
-"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along
-it."""
+"""Scan the edge, scan and touch the sphere, scan along the groove, then move the torch along it."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -7,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.systems.background import Answer, Background, Inline, import_module
@@ -115,7 +115,7 @@ def _planned(s: ProfilerState, step: str, q: Array, profiler: RenderedProfiler, 
 
 
 def _raised(planning: PlanningContext, q: Array) -> Array:
-    up = planning.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(planning.arm, q), q)
+    up = nearest_solution(planning.arm, RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(planning.arm, q), q)
     return planning.q_home if up is None else up
 
 
@@ -124,10 +124,10 @@ def _evaluated(s: ProfilerState, p: RenderedProfiler) -> ProfilerState:
     planning = _planning(s)
     if s.step == "edge":
         found = find_edge(planning.arm, p, planning.job, s.taken)
-        return replace(s, edge=found, edge_scans=s.taken, planning=planning.known(X_FS=found.estimate.X_FS))
+        return replace(s, edge=found, edge_scans=s.taken, planning=replace(planning, X_FS=found.estimate.X_FS))
     if s.step == "sphere":
         first = find_sphere(planning.arm, p, planning.job, s.taken)
-        known = planning.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
+        known = replace(planning, X_FS=first.estimate.X_FS, center=first.estimate.center)
         return replace(s, sphere_scans=s.taken, sphere=first, planning=known)
     if s.step == "touch":
         assert s.sphere is not None
@@ -136,7 +136,7 @@ def _evaluated(s: ProfilerState, p: RenderedProfiler) -> ProfilerState:
         e = sphere.estimate
         assert e.tip is not None
         X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
-        return replace(s, sphere=sphere, planning=planning.known(X_FS=X, center=e.center, p_FTip=e.tip))
+        return replace(s, sphere=sphere, planning=replace(planning, X_FS=X, center=e.center, p_FTip=e.tip))
     if s.step == "pass":
         assert s.sphere is not None
         assert planning.X_BP is not None

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.config import NoDevice, check_range
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
 
@@ -32,8 +32,7 @@ class PenConfig:
 
 @dc.dataclass(kw_only=True)
 class TabletConfig:
-    """`tablet:` nominal pose of the page (first landmark, x to the right, y down the page, z into it), and the
-    motion."""
+    """`tablet:` the page's nominal pose (first landmark, x right, y down the page, z into it), and the motion."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.60, 0.045, 0.010])
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, 0.0])
@@ -98,8 +97,7 @@ def check_tablet(scenario: Scenario) -> None:
         )
     if tablet.ring_mm >= min(tablet.across_mm, tablet.down_mm):
         raise InputError("tablet.ring_mm must be smaller than the landmarks' spacing, or the rings overlap.")
-    if not 0.0 <= tablet.tilt_deg <= STEEPEST_DEG:
-        raise InputError(f"tablet.tilt_deg must be from 0 to {STEEPEST_DEG:g}, and it is {tablet.tilt_deg:g}.")
+    check_range("tablet.tilt_deg", tablet.tilt_deg, 0.0, STEEPEST_DEG)
     check_pen(tablet.pen)
 
 
@@ -125,8 +123,10 @@ class WristPicture(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class TabletTouch(Message):
-    """One touch as the page records it: position (2,) px from the first landmark, to a tenth; `sequence` 0 before the
-    first."""
+    """One touch as the page records it: position (2,) px from the first landmark, to a tenth.
+
+    `sequence` 0 before the first.
+    """
 
     sequence: int = 0
     time: float = -np.inf

@@ -21,7 +21,7 @@ from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTruth, WristP
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.motion.clear_moves import clear_move
 from weldcal.systems.motion.guarded_path import check_path, straight
-from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -50,8 +50,10 @@ def camera_of(scenario: Scenario) -> RenderedWristCamera:
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of
-    reach."""
+    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included.
+
+    Raises InputError where out of reach.
+    """
     found = inverse_kinematics(arm, X_BF)
     if len(found) == 0:
         raise InputError("The arm cannot reach the tablet at its nominal pose; move it nearer in the scenario.")
@@ -129,8 +131,6 @@ class AddedVisit(AddedJob):
     procedure: TabletProcedure
     station: Station
     known: TabletTruth | None
-    ports: JobPorts
-    maximum_time_s: float
 
     @property
     def truth(self) -> TabletTruth:
@@ -186,23 +186,9 @@ class Tablet(Job[TabletPlan]):
         """See Job."""
         station, scenario = wiring.station, wiring.scenario
         procedure = wiring.add("tablet_procedure", TabletProcedure(station.arm, plan))
-        wiring.connect(
-            procedure,
-            position_measured=spine.arm.position,
-            settled_goal=spine.arm.settled_goal,
-            robot_status=spine.arm.status,
-            history=spine.arm.history,
-            picture=wiring.out("wrist_camera.picture"),
-            touch=wiring.out("digitizer.touch"),
-            hold=spine.end,
-        )
+        picture = wiring.out("wrist_camera.picture")
+        spine.serve(procedure, picture=picture, touch=wiring.out("digitizer.touch"))
         wiring.feed("wrist_camera.trigger", procedure.GetOutputPort("trigger"))
-        ports = JobPorts(
-            commands=(procedure.GetOutputPort("job"),),
-            state=procedure.GetOutputPort("state"),
-            velocity=procedure.GetOutputPort("descent"),
-            shown={"picture": wiring.out("wrist_camera.picture")},
-        )
         return AddedVisit(
             plan=plan,
             tablet=tablet_of(scenario),
@@ -210,7 +196,7 @@ class Tablet(Job[TabletPlan]):
             procedure=procedure,
             station=station,
             known=station.truth.tablet,
-            ports=ports,
+            ports=procedure.ports(shown={"picture": picture}),
             maximum_time_s=plan.maximum_time_s,
         )
 

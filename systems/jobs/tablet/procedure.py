@@ -1,5 +1,4 @@
-"""TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects
-it."""
+"""Take one picture of the tablet, then lower the pen onto each landmark until the tablet detects it."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar

@@ -19,7 +19,7 @@ from weldcal.systems.jobs.touch.procedure import Felt, TouchMotion, TouchProcedu
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.settings import servo_config
-from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, Spine
 from weldcal.systems.phase_words import TOUCH_STEPS, phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -29,7 +29,7 @@ TOUCHING = dict(TOUCH_STEPS)["Touch"]
 """Phases at a place."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedTouches(AddedJob):
     """The systems of the job, and the calibration that it judges."""
 
@@ -37,8 +37,6 @@ class AddedTouches(AddedJob):
     station: Station
     points: int
     procedure: TouchProcedure
-    ports: JobPorts
-    maximum_time_s: float
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
@@ -47,8 +45,7 @@ class AddedTouches(AddedJob):
         return phase_words(state.phase, at), 0.95 if state.finished else 0.1 + 0.8 * len(state.felt) / self.points
 
     def touches(self, root: Context) -> tuple[Touch, ...]:
-        """The touches so far: the tip where it was pressed to, its ball less by what it gave way, and the plane of the
-        scan there."""
+        """The touches so far: where the tip was pressed to, its ball less what it gave way, and the scan's plane."""
         return tuple(self._touch(f"touch{k + 1:02d}", felt) for k, felt in enumerate(self.state(root).felt))
 
     def height_m(self, felt: Felt) -> float:
@@ -118,29 +115,20 @@ class TouchJob(Job[TouchPlanning]):
             ArucoDeformationEstimator(station.arm, station.tool, scenario.finger_camera.camera(), station.background),
         )
         procedure = wiring.add("touch_procedure", TouchProcedure(station.arm, station.tool, motion))
-        command = procedure.GetOutputPort("job")
-        wiring.connect(planner, scan=wiring.out("scanner.scan"), job=command)
+        wiring.connect(planner, scan=wiring.out("scanner.scan"), job=procedure.GetOutputPort("job"))
         wiring.connect(finger, image=wiring.out("finger_camera.image"), history=spine.arm.history)
-        wiring.connect(
-            procedure,
-            position_measured=spine.arm.position,
-            settled_goal=spine.arm.settled_goal,
-            robot_status=spine.arm.status,
-            planned_touches=planner.GetOutputPort("planned_touches"),
-            deformation=finger.GetOutputPort("deformation"),
-            hold=spine.end,
-        )
+        planned, deformation = planner.GetOutputPort("planned_touches"), finger.GetOutputPort("deformation")
+        spine.serve(procedure, planned_touches=planned, deformation=deformation)
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
         wiring.feed("finger_camera.streaming", procedure.GetOutputPort("streaming"))
-        shown = {"scan": wiring.out("scanner.scan")}
-        ports = JobPorts(
-            commands=(command,),
-            state=procedure.GetOutputPort("state"),
-            velocity=procedure.GetOutputPort("descent"),
-            shown=shown,
+        return AddedTouches(
+            result=load_result(Path(config.result)),
+            station=station,
+            points=config.points,
+            procedure=procedure,
+            ports=procedure.ports(shown={"scan": wiring.out("scanner.scan")}),
+            maximum_time_s=motion.maximum_time_s,
         )
-        result = load_result(Path(config.result))
-        return AddedTouches(result, station, config.points, procedure, ports, motion.maximum_time_s)
 
 
 JOB = TouchJob()

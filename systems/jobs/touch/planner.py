@@ -16,7 +16,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background, BackgroundSystem
-from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
+from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice, check_range
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_root_anyhow
 from weldcal.systems.messages import JobCommand, Message, Scan
@@ -68,8 +68,7 @@ def check_touch(scenario: Scenario) -> None:
             raise InputError(f"touch.{name} must be a positive number, not {getattr(touch, name):g}.")
     if not FEWEST <= touch.points <= MOST:
         raise InputError(f"touch.points must be from {FEWEST} to {MOST}, not {touch.points}.")
-    if not 0.0 <= touch.turn_deg <= 45.0:
-        raise InputError(f"touch.turn_deg must be from 0 to 45, and it is {touch.turn_deg:g}.")
+    check_range("touch.turn_deg", touch.turn_deg, 0.0, 45.0)
 
 
 _COLUMN_M = 0.003  # points of the scan this near to a line along `up` show the face's height there
@@ -81,8 +80,10 @@ Joints = Array
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlace(Message):
-    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal
-    in the base."""
+    """A place to touch: joints above it, its scanned plane, and its point and outward normal in the base.
+
+    The plane is raw, in the camera's frame, with a sigma in m.
+    """
 
     q_above: Joints
     p_C: Array
@@ -103,8 +104,10 @@ class PlannedTouches(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlanning:
-    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's
-    numbers."""
+    """What touches are planned from.
+
+    Part, tool and arm as for a seam, the calibration to judge, and the job's numbers.
+    """
 
     seam: SeamPlanning
     X_BC: RigidTransform
@@ -187,8 +190,10 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
 
 
 def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
-    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the
-    sigma, m."""
+    """Plane of the face on the line through p_B along ``up``.
+
+    Point and normal towards the scanner as scanned, and the sigma, m.
+    """
     away = points_B - p_B
     height = away @ up
     column = (np.linalg.norm(away - height[:, None] * up, axis=1) < _COLUMN_M) & (np.abs(height) < 0.03)

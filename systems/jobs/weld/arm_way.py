@@ -1,5 +1,4 @@
-"""Plans the arm's way to a seam, along it and back, and searches for the change that makes an infeasible one
-feasible."""
+"""Plan the arm's way to a seam, along it and back, and search for the change that makes it feasible."""
 
 import dataclasses as dc
 import itertools
@@ -45,8 +44,10 @@ class SeamOutOfReach(InfeasiblePath):
 
 
 class ArmWay(NamedTuple):
-    """Joints (6,) rad at the touch's start, above it and above the far end; how far the tool leans, rad; and the seam
-    in joints."""
+    """Joints (6,) rad at the touch's start, above it and above the far end.
+
+    How far the tool leans, rad; and the seam in joints.
+    """
 
     q_start: Array
     q_above: Array
@@ -98,8 +99,9 @@ def leaning(
 
 
 def leans_with_clearance(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
-    """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that
-    fits.
+    """Leans, rad, that the job may use and with which the tool's body fits the part.
+
+    The upright tool's only where that fits.
 
     Raises:
         NoClearance: none fits, with the least lean that would.
@@ -195,8 +197,10 @@ def _displacements(centre: Array, up: Array) -> Iterator[tuple[RigidTransform, s
 
 
 def _postures(welder: Welder, seam: SeamCurve, any_branch: bool) -> Iterator[tuple[float, Array]]:
-    """Every branch above the seam's start, whole turns of a joint included, or whole turns of wrist 3 only, the nearest
-    to home first."""
+    """Every branch above the seam's start, or whole turns of wrist 3 only, the nearest to home first.
+
+    Whole turns of a joint are included.
+    """
     arm, home = welder.arm, welder.q_near
     above = _lifted(arm, seam, touch_start_pose(seam, welder.config), welder.clearance_m) @ welder.tool.X_FT.inverse()
     near, found = nearest_solution(arm, above, home), []
@@ -229,9 +233,8 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
             _check_clear(welder, way, X_BP, seed is not None)
             break
         except (SeamObstructed, SeamOutOfReach) as found:
-            problem = (
-                problem or found
-            )  # what is in the way at the first height, not that the arm does not reach a higher one
+            # what is in the way at the first height, not that the arm does not reach a higher one
+            problem = problem or found
             if share == HIGHER[-1] or isinstance(problem, SeamOutOfReach):
                 raise problem from found
     if lean and welder.workpiece is not None and X_BP is not None:
@@ -267,8 +270,7 @@ def seam_motions(tool: WeldingTool, seam: SeamCurve, config: ServoConfig) -> lis
 
 
 def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsewhere: bool) -> None:
-    """Check that the whole way keeps the arm and its tool clear of the surroundings and of itself, and the moves clear
-    of the part.
+    """Check that the whole way is clear of the surroundings and of the arm itself, and the moves of the part.
 
     The moves to another branch and back are also checked against the table.
 
@@ -301,8 +303,10 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
 
 
 def _lifted(arm: ArmModel, seam: SeamCurve, X_BT: RigidTransform, height_m: float, s: float = 0.0) -> RigidTransform:
-    """The tool's pose at X_BT raised out of the joint at arc length s m: up on a level face, else along the
-    bisector."""
+    """The tool's pose at X_BT raised out of the joint at arc length s m.
+
+    Up on a level face, else along the bisector.
+    """
     up = seam.frame(s).up
     return RigidTransform(
         X_BT.rotation(), X_BT.translation() + height_m * (arm.up if float(up @ arm.up) > _LEVEL else up)

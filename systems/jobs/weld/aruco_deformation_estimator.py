@@ -1,5 +1,4 @@
-"""ArucoDeformationEstimator: measures the soft tip's displacement from its rest position in the finger camera's
-images."""
+"""Measure the soft tip's displacement from its rest position in the finger camera's images."""
 
 import dataclasses as dc
 from typing import Any
@@ -23,8 +22,10 @@ IMAGES_KEPT = 10  # 1/3 s of images; after a longer gap the servo has stopped
 
 @dc.dataclass(frozen=True, eq=False)
 class Deformation(Message):
-    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time; None before the
-    first."""
+    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time.
+
+    None before the first.
+    """
 
     sequence: int = 0
     sample: DeflectionSample | None = None
@@ -34,8 +35,7 @@ class Deformation(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Work(Message):
-    """The last result, the newest image's number, and the images that wait for the arm's pose at their capture time,
-    oldest first."""
+    """The last result, the newest image's number, and the images that wait for the arm's pose, oldest first."""
 
     found: Deformation = dc.field(default_factory=Deformation)
     newest_sequence: int = 0
@@ -130,8 +130,10 @@ class ArucoDeformationEstimator(LeafSystem):
 def measure_deformation(
     image: Image, X_BF: RigidTransform, tool: WeldingTool, tag: TagModel, camera_matrix: np.ndarray
 ) -> Deformation:
-    """Tag detection and rest-pose difference for one image (grey (H, W)); invalid with a reason where the tag is not
-    seen."""
+    """Tag detection and rest-pose difference for one image (grey (H, W)).
+
+    Invalid with a reason where the tag is not seen.
+    """
     seen = detect_tag(image.pixels, camera_matrix, tag)
     X_BT = X_BF @ tool.X_FT
     if not seen.valid or seen.X_KM is None:

@@ -110,8 +110,10 @@ class FlangeEstimator(BackgroundSystem):
 
 
 def believed_capture(scan: StreamedScan, newest: FlangeEstimate, delay_s: float) -> float:
-    """When a frame was captured, s: by the device's time since the frame before where both have one, else by its
-    arrival."""
+    """When a frame was captured, s.
+
+    By the device's time since the frame before where both have one, else by its arrival.
+    """
     by_arrival = scan.arrival_time - delay_s
     if scan.device_time is None or newest.device_time is None:
         return by_arrival
@@ -123,8 +125,10 @@ def believed_capture(scan: StreamedScan, newest: FlangeEstimate, delay_s: float)
 def streamed_guess(
     X_CR: RigidTransform, before: FlangeEstimate, radius_m: float, standard: FlangeStandard
 ) -> FlangeGuess:
-    """Where to look in a frame: at the robot's X_CR, shifted as the frame before was; in ``radius_m`` where that shows
-    nothing."""
+    """Where to look in a frame: at the robot's X_CR, shifted as the frame before was.
+
+    In ``radius_m`` where that shows nothing.
+    """
     expected = X_CR.translation()
     if before.fit is not None and before.center_expected_C is not None:
         expected = expected + before.fit.center_C - before.center_expected_C
@@ -133,8 +137,10 @@ def streamed_guess(
 
 
 def points_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
-    """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and
-    some more; the whole scan where a coarse look finds none."""
+    """The rows and columns (h, w, 3) of a scan (H, W, 3) m with all points within ``radius_m`` of a place, and more.
+
+    The whole scan where a coarse look finds none.
+    """
     coarse = points_C[::_COARSE, ::_COARSE]
     with np.errstate(invalid="ignore"):
         near = np.square(coarse - np.asarray(center_C, dtype=np.float32)).sum(axis=2) < (1.2 * radius_m) ** 2
@@ -152,8 +158,10 @@ def _as_it_is(estimate: FlangeEstimate) -> FlangeEstimate:
 def estimate_streamed(
     base: FlangeEstimate, points_C: NDArray[np.float32], guess: FlangeGuess, standard: FlangeStandard
 ) -> FlangeEstimate:
-    """Fit the feature in a streamed frame near the guess; without a fit, the reason is given and no exception is
-    raised."""
+    """Fit the feature in a streamed frame near the guess.
+
+    Without a fit, the reason is given and no exception is raised.
+    """
     try:
         return dc.replace(base, fit=fit_flange(points_C.astype(float), standard, guess=guess, config=STREAM_FIT))
     except FlangeNotFound as error:

@@ -37,8 +37,9 @@ TIME_S = 120.0  # for which the job waits, at rest, for the folds beside a robot
 
 
 def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_scanner: bool) -> CalibrationStatus:
-    """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason; ``arm`` is the one
-    that observed.
+    """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason.
+
+    ``arm`` is the one that observed.
 
     Live scans have no hole patterns.
     """
@@ -123,8 +124,10 @@ class CalibrationPosePlanner(LeafSystem):
 
 @dc.dataclass(frozen=True, kw_only=True)
 class CalibratorConfig:
-    """The stop criterion of the live calibration (m) and the work point p_BWork (3,) in B at which the error is
-    evaluated; the cost of Algorithm 1 (section 4.2: work radius, m, and axes)."""
+    """The stop criterion of the live calibration (m), and the work point p_BWork (3,) in B at which it holds.
+
+    The cost is that of Algorithm 1 (section 4.2: work radius, m, and axes).
+    """
 
     required_error_m: float
     minimum_scans: int
@@ -195,8 +198,9 @@ def digest(
     q: Array | None = None,
     arm: ArmModel | None = None,
 ) -> CalibrationStatus:
-    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the
-    reason.
+    """Compute the status after one more flange estimate.
+
+    An unusable scan is listed as refused with its label and the reason.
 
     ``q`` (6,) rad are the joint angles of ``arm`` at the scan; a refinement needs both.
     """
@@ -244,8 +248,7 @@ def digest(
 
 
 def expected_error(estimate: CalibrationEstimate, p_BWork: Array) -> float:
-    """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's
-    covariance."""
+    """Expected error (m, rms) in the base of a point seen at the work point, by the estimate's covariance."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
 
 
@@ -275,8 +278,7 @@ def _algorithm_1(
 
 @dc.dataclass(frozen=True, eq=False)
 class NextScan(Message):
-    """A planned pose that was not visited, and the expected error (m) of a scanned point at the work point without and
-    with it."""
+    """A planned pose that was not visited, and the expected error (m) at the work point without and with it."""
 
     pose: PlannedPose
     error_now_m: float
@@ -293,8 +295,9 @@ class NextScan(Message):
 
 
 def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextScan | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
-    point most; None before the first estimate, or where all were visited.
+    """The unvisited planned pose that reduces the expected error at the work point most.
+
+    All are reachable, visible and clear; None before the first estimate, or where all were visited.
 
     The gain is computed by the planner; the present error is the estimate's.
     """

@@ -1,7 +1,8 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -64,8 +65,10 @@ def add_stream(
     queue: FrameQueue,
     status: OutputPort,
 ) -> tuple[OutputPort, OutputPort]:
-    """Add a queue of the streaming scanner's frames and an estimator called `name`; returns its estimates, and the
-    queue's frames."""
+    """Add a queue of the streaming scanner's frames and an estimator called `name`.
+
+    Returns its estimates, and the queue's frames.
+    """
     scenario, station = wiring.scenario, wiring.station
     wiring.add("frame_queue", queue)
     estimator = wiring.add(
@@ -143,18 +146,6 @@ SHARES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class WeldingPorts:
-    """Ports of the job's welding part; `logged` holds vector ports by their name in the log."""
-
-    seam: OutputPort
-    report: OutputPort
-    velocity: OutputPort | None = None
-    torch_wanted: OutputPort | None = None
-    margin: OutputPort | None = None
-    logged: dict[str, OutputPort] = field(default_factory=dict)
-
-
 @dataclass(eq=False, kw_only=True)
 class WeldJob(AddedJob):
     """The systems of the job and the data that they were built from."""
@@ -166,27 +157,30 @@ class WeldJob(AddedJob):
     sequencer: JobSequencer
     calibrator: IterativeCalibrator
     monitor: DriftMonitor | None
-    welding: WeldingPorts
-    ports: JobPorts
-    maximum_time_s: float
+    seam: OutputPort
+    report: OutputPort
     seams: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
-        return self.calibrator.status(self.calibrator.GetMyContextFromRoot(root))
+        status: CalibrationStatus = self.value(self.calibrator.GetOutputPort("calibration_status"), root)
+        return status
 
     def drift(self, root: Context) -> DriftStatus | None:
         """What the drift watch has found; None where the scanner does not stream."""
-        return None if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
+        if self.monitor is None:
+            return None
+        status: DriftStatus = self.value(self.monitor.GetOutputPort("drift"), root)
+        return status
 
     def planned_seam(self, root: Context) -> PlannedSeam:
         """The seam planner's newest plan; empty in a job that does not weld."""
-        plan: PlannedSeam = self.value(self.welding.seam, root)
+        plan: PlannedSeam = self.value(self.seam, root)
         return plan
 
     def servo_report(self, root: Context) -> ServoReport:
         """The servo's newest report."""
-        report: ServoReport = self.value(self.welding.report, root)
+        report: ServoReport = self.value(self.report, root)
         return report
 
     def view(self) -> tuple[Array, Array]:
@@ -257,43 +251,33 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         )
         wiring.connect(calibrator, flange_estimate=estimator.GetOutputPort("flange_estimate"), history=history)
         wiring.connect(chooser, calibration_status=status)
-        welding = _add_welding(wiring, spine, config, sequencer, status)
+        seam, report, welding = _add_welding(wiring, spine, config, sequencer, status)
         monitor = add_watch(wiring, spine, sequencer, status, X_FR)
         wiring.feed("scanner.trigger", sequencer.GetOutputPort("scan_trigger"))
-        wiring.connect(
+        spine.serve(
             sequencer,
-            robot_status=spine.arm.status,
-            settled_goal=spine.arm.settled_goal,
-            position_measured=spine.arm.position,
             next_pose=chooser.GetOutputPort("next_pose"),
             calibration_status=status,
-            planned_seam=welding.seam,
-            servo_report=welding.report,
-            hold=spine.end,
+            planned_seam=seam,
+            servo_report=report,
             arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
         )
         state = sequencer.GetOutputPort("job_state")
         results = {
             "flange_estimate": estimator.GetOutputPort("flange_estimate"),
             "calibration_status": status,
-            "planned_seam": welding.seam,
+            "planned_seam": seam,
         }
-        shown = {**results, "scan": wiring.out("scanner.scan"), "servo_report": welding.report}
+        shown = {**results, "scan": wiring.out("scanner.scan"), "servo_report": report}
         if wiring.meshcat is not None:
             drawn = {**shown, "job_state": state}
             if scenario.carried_scanner() is not None:
                 drawn["scan"] = wiring.constant("no_scan", Scan())  # the viewer's scanner is at rest
             add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, work_point(scenario), drawn)
-        logged = dict(welding.logged)
-        if logged:
-            logged["torch_on"] = spine.switch.GetOutputPort("process_on")
         ports = JobPorts(
             commands=(command,),
             state=state,
-            velocity=welding.velocity,
-            torch_wanted=welding.torch_wanted,
-            margin=welding.margin,
-            logged=logged,
+            **welding,
             results={"job": command, **results},
             shown={**shown, "next_pose": chooser.GetOutputPort("next_pose")},
         )
@@ -305,7 +289,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             sequencer=sequencer,
             calibrator=calibrator,
             monitor=monitor,
-            welding=welding,
+            seam=seam,
+            report=report,
             ports=ports,
             maximum_time_s=times.maximum_time_s,
             seams=times.seams,
@@ -343,9 +328,12 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
 
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
-) -> WeldingPorts:
-    """Add seam planner, deformation estimator, servo and guard; constant sources replace them in a cell without a
-    tool."""
+) -> tuple[OutputPort, OutputPort, dict[str, Any]]:
+    """Add seam planner, deformation estimator, servo and guard.
+
+    Constant sources replace them in a cell without a tool. Returns the ports of the planned seam and of the servo's
+    report, and further ones by their names in JobPorts.
+    """
     station, scenario = wiring.station, wiring.scenario
     tool, spec = station.tool, scenario.workpiece
     if (
@@ -354,9 +342,7 @@ def _add_welding(
         or station.cad is None
         or not isinstance(scenario.finger_camera, FingerCameraConfig)
     ):
-        return WeldingPorts(
-            seam=wiring.constant("no_seam", PlannedSeam()), report=wiring.constant("no_servo", ServoReport())
-        )
+        return wiring.constant("no_seam", PlannedSeam()), wiring.constant("no_servo", ServoReport()), {}
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
     position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
@@ -409,14 +395,10 @@ def _add_welding(
     for name, truth in (("tip_and_deflection", "cheat.contact"), ("torch", "cheat.torch")):
         if station.diagram.HasOutputPort(truth):
             logged[name] = out(truth)
-    return WeldingPorts(
-        seam=planner.GetOutputPort("planned_seam"),
-        report=servo.GetOutputPort("servo_report"),
-        velocity=guard.GetOutputPort("velocity"),
-        torch_wanted=servo.GetOutputPort("torch_on"),
-        margin=guard.GetOutputPort("margin"),
-        logged=logged,
-    )
+    logged["torch_on"] = spine.switch.GetOutputPort("process_on")
+    ports = {"velocity": guard.GetOutputPort("velocity"), "margin": guard.GetOutputPort("margin"), "logged": logged}
+    ports["torch_wanted"] = servo.GetOutputPort("torch_on")
+    return planner.GetOutputPort("planned_seam"), servo.GetOutputPort("servo_report"), ports
 
 
 JOB = Weld()

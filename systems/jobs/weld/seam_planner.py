@@ -81,8 +81,10 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class SeamPlanning(Welder):
-    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the
-    job's limits."""
+    """What a seam is planned from besides the scan.
+
+    What follows it, the nominal part and its expected pose, and the job's limits.
+    """
 
     workpiece: WeldPart
     X_BP_guess: RigidTransform
@@ -106,8 +108,7 @@ class SeamPlanning(Welder):
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
 
     def field_at(self, points_B: Array) -> Array:
-        """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld
-        them as drawn.
+        """The local field (n, 3) m at points (n, 3) m of the part, for the flange's orientation in the drawn weld.
 
         Where that orientation is none of the calibration's, or the points lie far from its poses, this is zero.
         """
@@ -225,8 +226,10 @@ def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, co
 def plan_seam(
     planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection, views: Views = ()
 ) -> PlannedSeam:
-    """Plan the seam from a scan of the part and the views before it; a plan that fails holds the reason, nothing is
-    raised."""
+    """Plan the seam from a scan of the part and the views before it.
+
+    A plan that fails holds the reason, nothing is raised.
+    """
     known = [(view.scan, view.X_BC) for view in (*views, ScanView(scan, X_BC)) if view.X_BC is not None]
     if len(known) <= len(views):
         return PlannedSeam(
@@ -265,9 +268,8 @@ def plan_seam(
             check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
         felt = is_felt(planning.workpiece, planning.tool)
         at, others = added_variance(planning, found, seam, plan, known[-1][1])
-        part_m = (
-            found.sigma_m if found.across_m is None else found.across_m
-        )  # a turn about a ring moves it along itself
+        # a turn about a ring moves it along itself
+        part_m = found.sigma_m if found.across_m is None else found.across_m
         sigma_m = math.sqrt(np.mean(np.square(part_m)) + np.mean(others))
         summary = f"{found.summary}; with scanner and arm its sigma is {1e3 * sigma_m:.2f} mm"
         if not felt:
@@ -291,8 +293,9 @@ def plan_seam(
 def interrupted(
     planning: SeamPlanning, seam: SeamCurve, stops: list[float], record: SeamRecord
 ) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
-    """The piece of an interrupted seam whose turn it is: its planning, its line, its record, and whether another one
-    follows.
+    """The piece of an interrupted seam whose turn it is.
+
+    Its planning, its line, its record, and whether another one follows.
 
     Raises:
         NoClearance: nothing is left of the seam.
@@ -382,8 +385,10 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
 
 
 def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre, in B; where `length_m` of arc is given the seam ends there, and the path
-    goes on."""
+    """The path of the seated tip's centre, in B.
+
+    Where `length_m` of arc is given the seam ends there, and the path goes on.
+    """
     seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
     line = workpiece.seam_P + seated.above_m * workpiece.up_P
     R = X_BP.rotation().matrix()
@@ -392,8 +397,9 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
 
 
 def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is
-    still in it.
+    """The seam along points (N,3) m.
+
+    Where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
 
     A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
     """

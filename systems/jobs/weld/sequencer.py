@@ -1,5 +1,7 @@
-"""JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract,
-hold."""
+"""JobSequencer: the state machine of the weld job.
+
+Home, calibrate, verify, scan, plan, approach, weld, retract, hold.
+"""
 
 import dataclasses as dc
 from collections.abc import Callable
@@ -49,9 +51,8 @@ class JobState(ProcedureState):
         label: of the newest scan.
         streaming: the finger camera streams.
         process_on: the process is enabled.
-        seam: number of the seam that is planned and welded, from 0.
         view: number of the newest scan of the workpiece, from 0.
-        seam: number of the seam that is planned and welded, from 0; piece: of its pieces, where it is interrupted.
+        seam: number of the seam that is planned and welded, from 0; piece: of that seam's pieces.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
     """
@@ -233,8 +234,10 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return self.go(s, now, phase, now.next_pose.q)
 
     def _digested(self, s: JobState, now: JobInputs) -> JobState:
-        """Continue after each calibration scan: more poses, verification, or hold where the required error is not
-        reached."""
+        """Continue after each calibration scan.
+
+        More poses, verification, or hold where the required error is not reached.
+        """
         status = now.calibration_status
         if status.sequence < s.trigger:
             return s

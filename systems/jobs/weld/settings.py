@@ -161,8 +161,7 @@ def seated_tip(station: Station, seam: int = 0) -> Seated:
 
 
 def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | None = None) -> tuple[PlannedPose, ...]:
-    """Plan all calibration and verification poses, or ``count``, best first, checked for reach, visibility and
-    clearance.
+    """Plan all calibration and verification poses, or ``count``, best first: reachable, visible and clear.
 
     Raises:
         UnreachableScanner: no such set of poses exists for the scanner at its nominal pose.
@@ -255,8 +254,7 @@ def check_scan_poses(scenario: Scenario) -> None:
 
 
 def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
-    """Whether a straight move (6,) rad between home and scan poses is clear of all that is known, the part at its guess
-    included."""
+    """Whether a straight move (6,) rad between home and scan poses is clear, also of the part at its guess."""
     bodies, spec, cad = station_bodies(station), scenario.workpiece, station.cad
     if not clear_move(scenario, station, bodies, q_a, q_b) or spec is None or cad is None:
         return False

@@ -33,8 +33,11 @@ _DIFFERENCE = 1e-2  # of the prior's standard deviation: micrometres
 
 @dataclass(frozen=True)
 class TipToTorch:
-    """Between tip and torch at the same place of a seam: ``sigma_m``, rms over the seam of the torch's distance from
-    the line that the tip felt, m, for arms of one accuracy; ``turn_rad``, the largest turn of the tool."""
+    """Between tip and torch at the same place of a seam.
+
+    ``sigma_m``, rms over the seam of the torch's distance from the line that the tip felt, m, for arms of one accuracy;
+    ``turn_rad``, the largest turn of the tool.
+    """
 
     sigma_m: float
     turn_rad: float
@@ -73,8 +76,10 @@ def tip_to_torch(
 
 
 def torch_sigma(arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array) -> float:
-    """The largest standard deviation m, across a seam, of where an arm as its maker leaves it puts the torch; NaN out
-    of its reach."""
+    """The largest standard deviation m, across a seam, of where an arm as its maker leaves it puts the torch.
+
+    NaN out of its reach.
+    """
     at = _held(arm, tool, seam, q_near)
     if at is None:
         return math.nan
@@ -86,8 +91,7 @@ def torch_sigma(arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 def _held(
     arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 ) -> tuple[Array, Array, list[RigidTransform], Array] | None:
-    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it, both ends on
-    the line."""
+    """Arcs (n,) of torch and tip, poses of T and joints (n, 6), with both ends of the tool on the line."""
     geometry = ToolGeometry(torch_offset_m=tool.chord_m, torch_clearance_m=0.0)
     unpressed = DeflectionControl(delta_d_m=_UNPRESSED_M, axial_d_m=_UNPRESSED_M)
     path = tool_path(seam, ServoConfig(tool=geometry, deflection=unpressed))
@@ -119,8 +123,10 @@ def _sensitivities(arm: ArmModel, tool: WeldingTool, q: Array, prior: FactoryPri
 
 
 def _covariance(size: int, stated: Mapping[str, Any] | None) -> Array:
-    """Covariance (k, k) of the links' errors in units of the prior: one where nothing was found, else as it is
-    stated."""
+    """Covariance (k, k) of the links' errors in units of the prior.
+
+    One where nothing was found, else as it is stated.
+    """
     covariance = np.eye(size)
     if stated is not None:
         which = np.array(stated["which"], dtype=int)

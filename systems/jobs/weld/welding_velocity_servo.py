@@ -1,5 +1,4 @@
-"""WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip
-deformation."""
+"""Compute the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -40,7 +39,7 @@ class ServoReport(Message):
     reason: str | None = None
     command: WeldingCommand | None = None
     state: WeldingState | None = None
-    time: float = np.nan  # of the tick, on the robot's clock
+    time: float = np.nan  # of the robot's sample, on the Diagram's clock, s
     X_BT: RigidTransform | None = None  # measured at that tick
     plan: int = 0  # sequence of the plan that is followed
     interruption: Interruption = dc.field(default_factory=Interruption)  # an operator's hold

@@ -296,13 +296,15 @@ def test_metres_called_millimetres_are_noticed_at_any_reach(folder: Path, scale:
     (folder / "poses.csv").write_text(text)
     load_dataset(folder)
     change(folder / "dataset.yaml", "poses: m}", "poses: mm}")
-    with pytest.raises(DatasetError, match="look like m; correct units"):
+    with pytest.raises(DatasetError, match=r"look like m; correct units in dataset\.yaml to 'poses: m'"):
         load_dataset(folder)
 
 
 def test_a_cloud_in_another_unit_than_stated_is_refused(folder: Path) -> None:
     change(folder / "dataset.yaml", "clouds: m,", "clouds: mm,")
-    with pytest.raises(CloudError, match=r"a\.npz lie 0\.000\d+ m from the camera, as mm: they look like m"):
+    with pytest.raises(
+        CloudError, match=r"a\.npz lie 0\.000\d+ m from the camera, as mm: they look like m; .* 'clouds: m'"
+    ):
         load_dataset(folder).cloud("a")
 
 

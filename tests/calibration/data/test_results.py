@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import open3d
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from typer.testing import CliRunner
@@ -32,7 +33,6 @@ from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.apply import applied
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -208,6 +208,11 @@ def test_a_result_corrects_points_and_names_how(result: CalibrationResult, tmp_p
     assert correction_note(result, tmp_path) is None
     corrected = replace(result, scanner_correction={"scale": 1.002, "gradient_per_m": [0.01, -0.01]})
     assert corrected.correct(points)[0] == pytest.approx(points[0] * (1.002 + 0.01 * 0.1 + 0.01 * 0.2), abs=1e-12)
+    grid, cloud = points.reshape(1, 2, 3), open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[:1]))
+    assert np.array_equal(corrected.correct(grid)[0], corrected.correct(points), equal_nan=True)
+    assert corrected.correct(cloud) == pytest.approx(corrected.correct(points)[:1])
+    with pytest.raises(InputError, match=r"\(N, 3\) or \(H, W, 3\) in metres; these are \(5, 4\)"):
+        corrected.correct(np.ones((5, 4)))
     file = save_result(corrected, tmp_path)
     note = correction_note(corrected, file) or ""
     assert f"weldcal apply {file} CLOUD" in note
@@ -239,6 +244,13 @@ def test_apply_corrects_a_cloud_and_maps_it_into_the_base(
     assert "--overwrite" in again.output
 
 
-def test_apply_refuses_the_base_for_a_scanner_on_the_arm(result: CalibrationResult) -> None:
-    with pytest.raises(InputError, match="X_BF X_FC"):
-        applied(replace(result, configuration="eye_in_hand"), np.zeros((3, 3)), base=True)
+def test_apply_corrects_a_scan_of_a_scanner_on_the_flange_and_refuses_the_base(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("schema: 1\nX_FC: {}\nscanner_correction: {scale: 1.01, gradient_per_m: [0.0, 0.0]}\n")
+    np.save(tmp_path / "scan.npy", np.full((40, 3), 0.5) + 0.01 * np.arange(120).reshape(40, 3))
+    call = ["apply", str(file), str(tmp_path / "scan.npy"), str(tmp_path / "to.npy")]
+    assert CliRunner().invoke(app, call).exit_code == 0
+    assert np.load(tmp_path / "to.npy") == pytest.approx(1.01 * np.load(tmp_path / "scan.npy"))
+    refused = CliRunner().invoke(app, [*call, "--base", "--overwrite"])
+    assert refused.exit_code == 1
+    assert "scanner on the flange (X_FC)" in refused.output

@@ -154,9 +154,7 @@ def test_whole_poses_of_usual_cells_err_as_stated(n: int) -> None:
             )
             X_CR = RigidTransform(RotationMatrix(R_CR.as_matrix()), p_C)
             observations.append(Observation(o.id, o.X_BR, p_C, X_CR.rotation().matrix()[:, 2]))
-            patterns[o.id] = HolePattern(
-                holes_C=np.zeros((5, 3)), angles_rad=np.zeros(5), center_C=p_C, X_CR=X_CR, ratio=1.0, rms_m=1e-6
-            )
+            patterns[o.id] = HolePattern(holes_C=np.zeros((5, 3)), center_C=p_C, X_CR=X_CR, ratio=1.0, rms_m=1e-6)
         stated = TURN + np.radians(0.1) * rng.normal()
         estimate = calibrate_from_few(observations, patterns, stated)
         e, joint = error(estimate), estimate.joint

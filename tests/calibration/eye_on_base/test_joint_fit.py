@@ -59,12 +59,7 @@ def _cell(
         J = needs.jacobian(seen)
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + NOISE_RATIO * rng.standard_normal()
         patterns[f"p{k:02d}"] = HolePattern(
-            holes_C=np.zeros((4, 3)),
-            angles_rad=np.zeros(4),
-            center_C=p_C,
-            X_CR=RigidTransform(R_CR, p_C),
-            ratio=ratio,
-            rms_m=0.0,
+            holes_C=np.zeros((4, 3)), center_C=p_C, X_CR=RigidTransform(R_CR, p_C), ratio=ratio, rms_m=0.0
         )
     return observations, patterns
 

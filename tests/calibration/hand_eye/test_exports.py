@@ -54,7 +54,7 @@ def test_urdf_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     assert root.tag == "robot"
     joint = root.find("joint")
     assert joint is not None
-    assert [joint.find(k).get("link") for k in ("parent", "child")] == ["flange", "camera_optical_frame"]  # type: ignore[union-attr]
+    assert [joint.find(k).get("link") for k in ("parent", "child")] == ["tool0", "camera_optical_frame"]  # type: ignore[union-attr]
     origin = joint.find("origin")
     assert origin is not None
     xyz, rpy = ([float(v) for v in str(origin.get(k)).split()] for k in ("xyz", "rpy"))
@@ -74,7 +74,7 @@ def test_ros_2_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     report, folder = written
     words = shlex.split((folder / "X_FC.static_transform.sh").read_text())
     said = dict(zip(words[4::2], words[5::2], strict=True))
-    assert (said["--frame-id"], said["--child-frame-id"]) == ("flange", "camera_optical_frame")
+    assert (said["--frame-id"], said["--child-frame-id"]) == ("tool0", "camera_optical_frame")
     turned = Rotation.from_quat([float(said[f"--q{k}"]) for k in "xyzw"]).as_matrix()
     p = [float(said[f"--{k}"]) for k in "xyz"]
     same(RigidTransform(RotationMatrix.ProjectToRotationMatrix(turned), p), report.result.X)

@@ -8,10 +8,10 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.hand_eye.poses import Array, noise, random_poses
-from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
+from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, inverse, pose
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.planning.next_pose import next_pose, view_of
 from weldcal.models.arms.chain import chain_forward, load_chain
 from weldcal.models.errors import InputError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.calibration.hand_eye.pair_sources import NAMED, READ, REFUSED
-from tests.calibration.hand_eye.pair_world import BASE, X_BASE, X
-from weldcal.calibration.errors import DatasetError
+from tests.calibration.hand_eye.pair_world import BASE, X_BASE, A, B, X
+from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.problem import full_problem
@@ -43,3 +43,25 @@ def test_what_holds_no_metric_poses_is_refused_with_advice(name: str, tmp_path: 
     make, mounting, words = REFUSED[name]
     with pytest.raises(DatasetError, match=words):
         read_pairs(make(tmp_path), mounting=mounting)
+
+
+def scaled(poses: np.ndarray, factor: float) -> np.ndarray:
+    found = poses.copy()
+    found[:, :3, 3] *= factor
+    return found
+
+
+@pytest.mark.parametrize("factors", [(1e3, 1.0), (1.0, 1e3)])
+def test_two_robots_in_two_units_are_named(tmp_path: Path, factors: tuple[float, float]) -> None:
+    path = tmp_path / "pairs.npz"
+    np.savez(path, A=scaled(A, factors[0]), B=B, C=scaled(A, factors[1]))
+    with pytest.raises(DatasetError, match="write the positions of both robots in one unit"):
+        read_pairs(path, mounting="co_manipulation")
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.037, "in another unit, or of unknown scale"), (0.6, "squares")])
+def test_only_a_small_factor_is_a_wrong_board(tmp_path: Path, factor: float, words: str) -> None:
+    path = tmp_path / "pairs.npz"
+    np.savez(path, A=A, B=scaled(B, factor))
+    with pytest.raises(InconsistentPoses, match=words):
+        read_pairs(path, mounting="eye_in_hand")

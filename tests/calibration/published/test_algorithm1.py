@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors, run_algorithm1
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     FAILED,
@@ -22,9 +22,9 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
     translation_and_rotation_cost,
     translation_cost,
-    work_radius_cost,
 )
 from weldcal.models.errors import InputError
+from weldcal.tools.commands.algorithm1_comparison import algorithm1_curve, run_algorithm1
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -133,9 +133,12 @@ def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None
     assert a.shape == (2, 15)
     assert np.isfinite(a).all()
     assert (a == b).all()
-    c, d = (convergence(observations[:-1], CentreVerification(observations[-1]), orders=2, seed=1) for _ in range(2))
+    *scans, held = observations
+    c, d = (convergence(scans, orders=2, seed=1) for _ in range(2))
     assert np.array_equal(c.held_out, d.held_out, equal_nan=True)
-    assert np.array_equal(c.figure_true, d.figure_true, equal_nan=True)
+    e, f = (algorithm1_curve(scans, CentreVerification(held), c.counts, orders=2, seed=1) for _ in range(2))
+    assert e[1].shape == c.held_out.shape
+    assert np.array_equal(e[1], f[1], equal_nan=True)
     with pytest.raises(InputError, match="cannot be divided into 20 folds"):
         k_fold(observations, folds=20)
 
@@ -143,7 +146,7 @@ def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None
 def test_a_scenario_names_its_cost_and_the_axes_that_matter() -> None:
     error = np.array([0.001, 0.0, 0.002, 3e-4, 4e-4, 12e-4])
     assert named_cost("translation")(error) == pytest.approx(np.linalg.norm(error[3:]))
-    assert named_cost("work_radius", 0.2)(error) == pytest.approx(work_radius_cost(0.2)(error))
+    assert named_cost("work_radius", 0.2)(error) == pytest.approx(axes_cost((0, 1, 2, 3, 4, 5), 0.2)(error))
     # section 4.2: pick and place with an end-effector that gives way along z
     assert named_cost("work_radius", 0.2, ("x", "y"))(error) == pytest.approx(5e-4)
     assert named_cost("work_radius", 0.5, ("yaw",))(error) == pytest.approx(1e-3)

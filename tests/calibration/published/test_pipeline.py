@@ -15,7 +15,6 @@ from weldcal.calibration.published.algorithm1 import (
     algorithm1_step,
     axes_cost,
     translation_cost,
-    work_radius_cost,
 )
 from weldcal.calibration.published.pipeline import (
     CircleParameters,
@@ -181,5 +180,7 @@ def test_as_printed_a_new_pair_may_enter_more_than_once() -> None:
 
 def test_costs_of_section_4_2() -> None:
     error = np.array([0.01, 0.0, 0.02, 3e-3, 0.0, 4e-3])
-    assert work_radius_cost(0.1)(error) == pytest.approx(np.sqrt(0.001**2 + 0.002**2 + 0.003**2 + 0.004**2))
+    assert axes_cost((0, 1, 2, 3, 4, 5), 0.1)(error) == pytest.approx(
+        np.sqrt(0.001**2 + 0.002**2 + 0.003**2 + 0.004**2)
+    )
     assert axes_cost((3, 4), 0.1)(error) == pytest.approx(3e-3)

@@ -61,7 +61,7 @@ def test_a_level_tablet_and_no_noise_leave_the_closed_form_no_error() -> None:
     found = fit_linear(level)
     assert np.abs(found.residuals_m).max() < 1e-12
     assert found.scale == pytest.approx(1.0, abs=1e-9)
-    np.testing.assert_allclose(found.pen_m, fit.pen_m, atol=1e-9)
+    np.testing.assert_allclose(found.parameters[4:], fit.parameters[3:5], atol=1e-9)
 
 
 def test_leverages_give_what_fitting_again_gives() -> None:
@@ -80,7 +80,7 @@ def test_the_published_data_are_predicted_within_their_own_rounding() -> None:
     assert 1e3 * np.linalg.norm(fit.leave_one_out_m, axis=1).mean() <= 0.46
     assert 1e3 * fit.sigma_m == pytest.approx(0.297, abs=0.001)
     assert fit.scale == pytest.approx(1.0107, abs=0.002)
-    np.testing.assert_allclose(1e3 * fit.pen_m, [0.10, -21.67], atol=0.01)
+    np.testing.assert_allclose(1e3 * fit.parameters[4:], [0.10, -21.67], atol=0.01)
 
 
 @pytest.mark.parametrize("seed", [11, 12])
@@ -124,10 +124,10 @@ def test_the_covariance_tells_how_far_the_pen_is_off() -> None:
     squares = []
     for k in range(60):
         t = simulate_trial((21, k), EXACT).touches
-        true = fit_planar(t, leave_one_out=False).pen_m
+        true = fit_planar(t, leave_one_out=False).parameters[3:5]
         noisy = replace(t, hand_m=t.hand_m + rng.normal(0.0, 0.3e-3, t.hand_m.shape))
         fit = fit_planar(noisy, leave_one_out=False)
-        e = fit.pen_m - true
+        e = fit.parameters[3:5] - true
         squares.append(e @ np.linalg.solve(fit.covariance[3:5, 3:5], e))
     # mean 2 (13 / 11 more for the estimated sigma: an F distribution), its standard error 2 / sqrt(60) * 1.4: +- 3 of
     # them

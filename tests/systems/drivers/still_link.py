@@ -21,20 +21,9 @@ class StillLink:
 
     def state(self) -> LinkState:
         """What a worker would have written."""
-        counts = {"sent": 0, "heard": 0, "late_periods": 0}
-        times = dict.fromkeys(
-            ("fault_time", "echo_latency_s", "worst_period_s", "clock_residual_s", "clock_drift"), 0.0
-        )
+        state = {"robot_mode": 7, "safety_mode": 1, "runtime_state": 2, "speed_scaling": 1.0}
         return LinkState(
-            q=self.q,
-            qd=self.qd,
-            robot_time=self.robot_time,
-            sampled_at=0.0,
-            age_s=self.age_s,
-            fault=self.fault,
-            program_running=self.fault is Fault.NONE,
-            **counts,
-            **times,
+            q=self.q, qd=self.qd, robot_time=self.robot_time, age_s=self.age_s, fault=self.fault, arc=-1, **state
         )
 
     def command(self, qd: np.ndarray, process: bool = False) -> int:

@@ -59,7 +59,6 @@ def seen(k: int, error_m: float = 0.0, purpose: str = "calibrate") -> FlangeEsti
         outer_radius_m=0.0315,
         bore_radius_m=None,
         n_points=5000,
-        n_rim=200,
         coverage=0.9,
     )
     return FlangeEstimate(sequence=k, capture_time=0.1 * k, purpose=purpose, label=f"pose{k:02d}", fit=fit)

@@ -151,7 +151,6 @@ FIT = FlangeFit(
     outer_radius_m=0.0315,
     bore_radius_m=None,
     n_points=900,
-    n_rim=90,
     coverage=0.9,
 )
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])

@@ -35,7 +35,6 @@ def test_scanner_and_ring_are_drawn_where_they_are_believed() -> None:
         outer_radius_m=0.03,
         bore_radius_m=None,
         n_points=1000,
-        n_rim=100,
         coverage=1.0,
     )
     view.GetInputPort("flange_estimate").FixValue(

@@ -48,7 +48,6 @@ FIT = FlangeFit(
     outer_radius_m=0.0315,
     bore_radius_m=None,
     n_points=1000,
-    n_rim=100,
     coverage=1.0,
 )
 

@@ -26,7 +26,7 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
+from weldcal.tools.report.calibration import CalibrationReport, calibration_report
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
 from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
@@ -35,6 +35,7 @@ from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.mounting import MountingReport, mounting_report
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
+from weldcal.tools.report.render import statistics
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
@@ -50,7 +51,7 @@ ESTIMATE = estimate_eye_on_base(OBSERVATIONS, SolveConfig(hypotheses=40))
 RESULT = CalibrationResult(
     X_BC=ESTIMATE.X_BC,
     covariance=ESTIMATE.covariance,
-    held_out_mm=error_summary(1e3 * ESTIMATE.held_out.position_m),
+    held_out_mm=statistics(1e3 * ESTIMATE.held_out.position_m),
     tilt_deg={"median": 0.01, "p95": 0.03},
     poses=tuple(
         PoseRecord(
@@ -70,7 +71,7 @@ RESULT = CalibrationResult(
 def calibrate() -> Made:
     """`calibrate` of ten scans within its tolerance, with a warning."""
     counts = np.arange(4, 10)
-    curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
+    curve = Convergence(counts, 1e-4 * np.ones((2, len(counts))))
     report = CalibrationReport(
         result=RESULT,
         estimate=ESTIMATE,
@@ -81,7 +82,7 @@ def calibrate() -> Made:
         outliers=(),
         algorithm1=None,
         convergence=curve,
-        k_fold_mm=error_summary(np.array([0.2])),
+        k_fold_mm=statistics(np.array([0.2])),
         seconds=1.0,
         out=OUT,
         advice=("Add a pose near (1, 2, 3).",),

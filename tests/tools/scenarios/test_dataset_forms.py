@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
+from typer.testing import CliRunner
 
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite, write_bag
 from weldcal.tools.commands.cell.new import FILES, write_example
 
@@ -70,3 +72,13 @@ def test_a_recording_without_its_reader_says_what_to_install(folder: Path, monke
     (folder / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(DatasetError, match=r"install the package for it: pip install 'weldcal\[ros\]'"):
         load_dataset(folder)
+
+
+def test_an_example_says_first_how_long_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> Path:
+        raise InputError("It was begun.")
+
+    monkeypatch.setattr("weldcal.tools.commands.cell.new.write_example", fails)
+    words = ["new", str(tmp_path / "x"), "--dataset"]
+    assert CliRunner().invoke(app, words).stdout.splitlines()[0].endswith("takes about two minutes.")
+    assert "minutes" not in CliRunner().invoke(app, [*words, "--json"]).stdout

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.harness import MISSED, Study, Target, statistics
+from weldcal.tools.report.render import statistics
+from weldcal.tools.studies.harness import MISSED, Study, Target
 
 
 def half(n: int) -> Mapping[str, object]:

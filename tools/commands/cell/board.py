@@ -73,8 +73,7 @@ def print_board(
 
 @dataclass(kw_only=True)
 class Sheet:
-    """A page: black rectangles, then white ones over them, thin lines (x0, y0, x1, y1) and texts (x, y, size, words),
-    in mm."""
+    """A page in mm: black rectangles, white ones over them, thin lines (x0, y0, x1, y1), texts (x, y, size, words)."""
 
     width: float
     height: float
@@ -188,8 +187,10 @@ def board_sheet(board: CharucoBoard, paper: str) -> Sheet:
 
 
 def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
-    """What a description of a board says, in the middle of a page, with the description. Raises InputError where it
-    does not fit."""
+    """What a description of a board says, in the middle of a page, with the description.
+
+    Raises InputError where it does not fit.
+    """
     sheet = _page(paper)
     size, gap = 1e3 * board.size, 1e3 * board.inner
     points = 1e3 * board.points[:, :2]

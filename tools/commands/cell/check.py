@@ -1,5 +1,7 @@
 """weldcal check-cell: looks at every device of a scenario and says what to do; weldcal tool check: draws a tool.
-Nothing moves."""
+
+Nothing moves.
+"""
 
 import dataclasses as dc
 import inspect
@@ -216,8 +218,7 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
 
 
 def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) -> Check:
-    """Whether the feature of the calibration is in a scan, near where the arm's pose and the scanner's nominal pose put
-    it."""
+    """Check that the calibration's feature is in a scan, near where arm and nominal scanner put it."""
     standard, on_tool = feature_standard(scenario), scenario.calibration.feature == "tool_ring"
     loaded = scenario.loaded_tool()
     guess = None

@@ -23,8 +23,7 @@ _REST_S = 2.0
 
 
 def rewrite(folder: Path, form: str) -> Path:
-    """Write the poses and clouds of a plain dataset folder in another form, in their place; the rest of dataset.yaml
-    stays.
+    """Write poses and clouds of a plain dataset folder in another form, in their place; dataset.yaml keeps the rest.
 
     Raises:
         InputError: no such form, or a package that it needs is not installed.

@@ -78,8 +78,7 @@ def finger_calibrate(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FingerReport:
-    """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at
-    rest."""
+    """The camera, the tip (None without touches), pictures without a board, and the tag's pose at rest."""
 
     camera: FingerIntrinsics
     tip: TipCalibration | None
@@ -91,8 +90,11 @@ class FingerReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. There is no work point: the error of a touch that the fit did not use stands in its place;
-        without touches the reprojection of pictures that were left out."""
+        """The first screen.
+
+        There is no work point: the error of a touch that the fit did not use stands in its place; without
+        touches the reprojection of pictures that were left out.
+        """
         c, tip = self.camera, self.tip
         concerns = [] if tip is None else [f"Open: {text}" for text in tip.unknown]
         lost = f"The board was not found in {len(self.without_board)} pictures ({', '.join(self.without_board[:4])})."
@@ -173,9 +175,10 @@ class FingerReport:
 def calibrate_finger(
     folder: Path, board: Path, touches: Path | None, out: Path, tool: Path | None = None, limit_mm: float | None = None
 ) -> FingerReport:
-    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml
-    and report.html to `out`. `limit_mm` is the error of a touch that the job allows. `tool` is the file of the tool
-    that carries the tag; None: the welding tool.
+    """Calibrate from pictures of the board and a table of touches; write finger.yaml and report.html to `out`.
+
+    The table has a picture for each touch. `limit_mm` is the error of a touch that the job allows. `tool` is the
+    file of the tool that carries the tag; None: the welding tool.
 
     Raises:
         InputError: what was given cannot be used; nothing is written.

@@ -139,6 +139,8 @@ def new(
     if form and not dataset:
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
+        if not call.json:
+            typer.echo("The scans are rendered in simulation, which takes about two minutes.")
         written = write_example(folder, call.seed, call.progress, form)
         following, note = f"weldcal calibrate {written}", {}
     else:
@@ -167,8 +169,7 @@ def edge_numbers(text: str) -> list[int]:
 
 
 def write_example(folder: Path, seed: int, progress: Progress = no_progress, form: str = "") -> Path:
-    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur, matrices,
-    opencv ...).
+    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur ...).
 
     Raises:
         InputError: there is something in the folder already, or no such form.
@@ -193,8 +194,7 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
 
 @dataclass(frozen=True)
 class OwnPart:
-    """A part's file, the numbers of the seam's edges (none: the best that can be welded), the joint (None: by its
-    angle), its unit."""
+    """A part's file, the seam's edges (none: the best), the joint (None: by its angle) and the unit."""
 
     file: Path
     edges: tuple[int, ...] = ()
@@ -417,8 +417,7 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
 def _first_refusal(
     scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
 ) -> tuple[int, str]:
-    """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for
-    none."""
+    """Count the seams before the first that the arm cannot weld with the part in a pose, and say why ("": all)."""
     for number, part in enumerate(seams):
         config = servo_config(scenario, station, number)
         planning = dc.replace(
@@ -467,8 +466,7 @@ def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], sce
 
 
 def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
-    """Make a file the scenario's tool: one of weldcal's is copied into the cell's folder as tool.yaml, another stays
-    where it is."""
+    """Make a file the scenario's tool; one of weldcal's is copied into the cell's folder as tool.yaml."""
     ours = tool.parent == WELDING.parent
     if ours:
         shutil.copyfile(tool, folder / TOOL)

@@ -137,9 +137,8 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         )
     if hint := unit_hint(shape):
         typer.echo(hint)
-    typer.echo(
-        f"Pick by number in the scenario, workpiece.seams: [{{edges: [ID, ...]}}]. Picture: {folder / 'report.html'}"
-    )
+    pick = "Pick by number in the scenario, workpiece.seams: [{edges: [ID, ...]}]. " if seams else ""
+    typer.echo(f"{pick}Picture: {folder / 'report.html'}")
 
 
 def _figures(edge: PartEdge) -> tuple[str, str, str]:
@@ -225,8 +224,7 @@ def _towards(elevation: float, azimuth: float) -> Array:
 
 
 def _number(axes: Axes3D, shape: PartShape) -> None:
-    """Write the edges' numbers, those of joints and long edges first, each where it covers no other; else not at
-    all."""
+    """Write the edges' numbers, joints and long edges first, each where it covers no other; else not at all."""
     order = {"concave": 0, "flush": 0, "boundary": 1, "convex": 1}
     edges = sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], -e.length_m))
     placed: list[Array] = []

@@ -1,5 +1,4 @@
-"""Proposes from where a scanner on the flange scans a part: views along it that overlap, each reached and tried by a
-scan."""
+"""Propose from where a scanner on the flange scans a part: overlapping views, each reached and tried by a scan."""
 
 import dataclasses as dc
 import math
@@ -36,8 +35,7 @@ CARRIED = "carried_scanner"
 
 
 def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
-    """Write into a scenario from where a scanner on the flange scans its part, or say why a scan does not show the
-    part.
+    """Write scan poses of a scanner on the flange into a scenario, or say why a scan does not show the part.
 
     Args:
         scenario: the scenario; its part lies where the arm can weld it.
@@ -71,8 +69,7 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
 
 
 def _too_long(scenario: Scenario, station: Station) -> str:
-    """Why one scan of a scanner beside the arm does not show a part that the arm could weld; "" where size is not the
-    cause."""
+    """Say why one scan beside the arm does not show a part that the arm could weld; "" where size is not the cause."""
     cad, X_BP = _part(scenario, station)
     scanner, planning = scenario.scanner, seam_planning(scenario, station, servo_config(scenario, station))
     refused = plan_drawn_seam(dc.replace(planning, advises=False), 0).reason is not None
@@ -99,8 +96,7 @@ def _scanner(scenario: Scenario) -> tuple[ScannerPreset, RigidTransform]:
 
 
 def _lying(mesh_B: TriMesh, up: Array) -> tuple[Array, Array, Array]:
-    """The part's box that stands upright: axes (3,3) in columns, the longest level one first and up last; size (3,);
-    middle (3,)."""
+    """Compute the part's upright box: axes (3,3) in columns, longest level one first, up last; size and middle (3,)."""
     R = RotationMatrix.MakeFromOneVector(up, 2).matrix()
     q = mesh_B.vertices @ R
     _, sides, turn = cv2.minAreaRect(q[:, :2].astype(np.float32))
@@ -133,8 +129,7 @@ def scan_poses(scenario: Scenario, station: Station) -> list[Array]:
 
 
 def _spread(scanner: ScannerPreset, size: Array) -> tuple[Array, float]:
-    """Middles of the scans along the part, m from its own, and the scanner's distance; equal overlaps, also beyond the
-    ends.
+    """Compute the middles of the scans along the part (m, equal overlaps, also at the ends) and the distance.
 
     Raises:
         InputError: the part is wider than a scan at any distance.

@@ -36,8 +36,7 @@ NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 @dataclass(frozen=True, kw_only=True)
 class Seam:
-    """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it
-    can).
+    """A joint of a part, its smallest radius in m (None: straight), and why a tool cannot weld it ("": it can).
 
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
     felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was
@@ -83,8 +82,7 @@ class Seam:
 
 
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """The joints of a part: those that the tool can weld first, the longest first, then the others, the nearest miss
-    first.
+    """Sort a part's joints: those that the tool can weld, longest first, then the others, nearest miss first.
 
     The arm is not asked.
     """
@@ -98,8 +96,10 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
 
 
 def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
-    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, by how
-    much, m, and if it is felt."""
+    """Say why a tool does not fit a joint, by how much (m), and whether the joint is felt.
+
+    Its ball is tried at the walls, its body at the middle of one of the edges.
+    """
     flush = joint.angle_rad > math.pi - 0.01
     half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
     section, felt = JointSection(half, *joint.walls_m, gap), True
@@ -141,8 +141,10 @@ def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
 
 
 def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
-    """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; ""
-    for a joint that is none of these."""
+    """Name the least pipe whose outside the tool can weld onto a plate, both as far as the joint's longer wall.
+
+    It is "" for a joint that is none of these.
+    """
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""

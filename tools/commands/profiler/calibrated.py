@@ -126,8 +126,7 @@ def _source(folder: Path, skip: set[Path]) -> Path:
 
 
 def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple[Array, str]:
-    """The times (n,) s of the profiles, and their unit: the stated one, or the one in which half of them lie in the
-    robot's stream."""
+    """Find the times (n,) s of the profiles and their unit: the stated one, or that which fits the robot's stream."""
     times, stated = profiles.times, profiles.time_unit
     if (folder / _TIMES).is_file():
         blocks = blocks_of(read_text(folder / _TIMES), _TIMES)
@@ -158,8 +157,7 @@ def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple
 
 
 def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, side: str) -> tuple[Array, Array, int]:
-    """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show
-    it."""
+    """Find times (n,) s and points (n, 2) m where profiles cross the edge, and how many do not show it."""
     kept, points, lost = [], [], 0
     for t, found in zip(stamps, profiles.points, strict=True):
         at = scale * found
@@ -197,8 +195,10 @@ def seam(
 
 
 def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
-    """The measurements with their poses read as those of the calibration were. Raises InputError where several readings
-    are left."""
+    """The measurements with their poses read as those of the calibration were.
+
+    Raises InputError where several readings are left.
+    """
     if len(data.readings) > 1:
         data = data.with_form(str(load_record(calibration).figures.get("robot_form", "")))
     if len(data.readings) > 1:

@@ -244,8 +244,10 @@ def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[E
 
 
 def edge_held_out(poses: FlangePoses, points: Floats, sigmas_mm: Mapping[str, float]) -> Floats:
-    """Distance (n,) mm of each point (n, 2) m from the edge of a calibration without its fifth of the scans; NaN where
-    there is none."""
+    """Compute distances (n,) mm of points (n, 2) m from the edge of a calibration without their scans; NaN: none.
+
+    A fifth of the scans is left out at a time.
+    """
     found, n = np.full(len(points), np.nan), len(points)
     for fold in range(FOLDS):
         out = np.arange(n) % FOLDS == fold

@@ -1,5 +1,4 @@
-"""Read measurements of a profiler from NPZ, tables, exports and folders into SI units and one set of names (layouts:
-docs/profiler.md)."""
+"""Read profiler measurements from NPZ, tables, exports and folders into SI units (layouts: docs/profiler.md)."""
 
 import hashlib
 import re
@@ -48,8 +47,7 @@ LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 @dataclass(frozen=True)
 class PosesStated:
-    """What the user states of an export's poses: their file, their form, and the distance of points (mm) where it holds
-    heights only."""
+    """What the user states of an export: poses' file and form, and points' distance (mm) where it holds heights."""
 
     poses: Path | None = None
     form: str = ""
@@ -80,8 +78,10 @@ class Measurements:
     notes: tuple[str, ...] = ()
 
     def decided(self, fit: Fit, what: str) -> "Measurements":
-        """The same with the reading of the poses that the profiles select. Raises InconsistentData where they select
-        none."""
+        """The same with the reading of the poses that the profiles select.
+
+        Raises InconsistentData where they select none.
+        """
         if len(self.readings) < 2:
             return self
         k, sentence = choose_reading(self.readings, fit, what)
@@ -311,8 +311,7 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
 
 
 def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
-    """One row for each profile point: the flange's x, y, z and rotation vector, then the point; scans by a column
-    `scan`."""
+    """Read one row a profile point: the flange's x, y, z and rotation vector, the point, and the column `scan`."""
     header, rows = read_rows(path)
     if not rows:
         raise InputError(f"'{path.name}' needs a header and a row of numbers for each profile point.")

@@ -1,5 +1,4 @@
-"""weldcal profiler live: the profiler job, its measurement files, calibrations and report; for several seeds, a
-table."""
+"""Run the profiler job: measurement files, calibrations and report; for several seeds, a table."""
 
 import hashlib
 import io
@@ -72,8 +71,7 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
 
 
 def write_live(live: ProfilerLive, finished: JobRun) -> None:
-    """Write edge.npz, sphere.npz, seam.npz (as weldcal profiler reads them), edge/ and sphere/ with profiler.yaml,
-    seam.csv, report.html."""
+    """Write edge.npz, sphere.npz, seam.npz, edge/ and sphere/ with profiler.yaml, seam.csv and report.html."""
     s, arm, folder = live.state, finished.cell.station.arm, live.folder
     folder.mkdir(parents=True, exist_ok=True)
     job = live.run.cell.job.job

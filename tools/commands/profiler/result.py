@@ -1,5 +1,4 @@
-"""What `edge`, `sphere` and `compensate` share: their options, the sigmas, and the files and report of a
-calibration."""
+"""Hold what `edge`, `sphere` and `compensate` share: options, sigmas, and the files of a calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -97,8 +96,7 @@ def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | Pro
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of sensor and robot, m; `stated`: given by the user or the file, so points beyond them are
-    outliers."""
+    """Standard deviations of sensor and robot, m; `stated`: given, so that points beyond them are outliers."""
 
     robot_m: float = 0.03e-3
     x_m: float = 0.05e-3

@@ -94,8 +94,11 @@ class VisitFiles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TabletCalibration:
-    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand
-    and the errors at the file's queries; and the duration."""
+    """The result, its report's data, and the duration.
+
+    The fit with full poses where it is one; else the rounding step of the hand and the errors at the file's
+    queries.
+    """
 
     result: TabletResult
     shown: Shown

@@ -23,7 +23,7 @@ from weldcal.tools.commands.tablet.calibrate import TabletCalibration, VisitFile
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.run import RunOptions, run_document
 from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
 
 MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
@@ -63,14 +63,7 @@ class TabletDemo:
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet demo`."""
-        said: dict[str, object] = {
-            "state": "held" if self.run.held else "done",
-            "scenario": self.options.scenario,
-            "seed": self.options.seed,
-            "robot": self.robot,
-        }
-        if self.run.reason:
-            said["reason"] = self.run.reason
+        said = run_document(self.run, self.options, self.robot)
         touches = len(self.run.cell.job.state(self.run.root).touches)
         return {**said, "n_touches": touches, **self.found, **self.run.timing()}
 
@@ -99,8 +92,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
 
 
 def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCalibration, dict[str, object]]:
-    """Write the run's files, calibrate from them as `weldcal tablet calibrate` does, and compare with the ground
-    truth."""
+    """Write the run's files, calibrate from them as `tablet calibrate` does, and compare with the truth."""
     folder, tablet = options.out, run.cell.job.tablet
     write_visit(run, folder)
     done = calibrate_tablet(
@@ -153,8 +145,7 @@ def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]
 
 
 def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
-    """Depth errors (rms) of the landmarks, apart from the scale: from the tablet's plane, and from each landmark's
-    pixel."""
+    """Compute depth errors (rms) of the landmarks, apart from scale: from the page's plane, and from pixels."""
     job = run.cell.job
     K, truth, depth_m = job.camera.camera_matrix(), job.truth, job.picture(run.root).depth_m
     X_CT = (forward_kinematics(run.cell.station.arm, job.state(run.root).q_look) @ truth.X_FC).inverse() @ truth.X_BT

@@ -25,11 +25,10 @@ from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, render, write_atomic
+from weldcal.tools.report.render import fixed, render, statistics, write_atomic
 from weldcal.tools.report.tablet import Page, visits_screen
 
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"
@@ -108,8 +107,7 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
 
 
 def best_model(visits: Sequence[VisitFits]) -> tuple[str, dict[str, float]]:
-    """The model with the smallest held-out error over all visits, and every model's mean held-out error (mm; NaN:
-    none).
+    """Choose the model of least held-out error over all visits; also every model's mean error (mm; NaN: none).
 
     A free scale is a candidate only if every visit needs it. Only landmarks that every model could hold out are
     compared; with four landmarks there are none, and PnP is chosen.
@@ -334,7 +332,7 @@ class ManyVisits:
 
 def error_figures(errors_mm: Array) -> dict[str, float] | None:
     """Median, mean, 95th percentile and maximum of errors (n,) mm; None where there are none."""
-    return error_summary(errors_mm) if errors_mm.size else None
+    return statistics(errors_mm) if errors_mm.size else None
 
 
 def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVisits:

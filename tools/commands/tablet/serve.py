@@ -1,5 +1,4 @@
-"""weldcal tablet serve: serves the page to a tablet under an unguessable path and receives its touches as a CSV
-file."""
+"""Serve the page to a tablet under an unguessable path and receive its touches as a CSV file."""
 
 import errno
 import ipaddress
@@ -102,8 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self._say(HTTPStatus.OK, f"Written to {path.name} on the computer.")
 
     def _own(self) -> list[str]:
-        """The origins of this server as this connection reaches it: its own address, and localhost where that is
-        loopback."""
+        """List this server's origins as a connection reaches it: its own address, and localhost on loopback."""
         here = ipaddress.ip_address(str(self.connection.getsockname()[0]).partition("%")[0])
         host = str(getattr(here, "ipv4_mapped", None) or here)
         names = [_in_url(host), *(["localhost"] if is_loopback(host) else [])]

@@ -1,5 +1,4 @@
-"""Bridges between a cell and two devices of its world, the scanner and the finger camera, on which a test does what
-wires and devices do.
+"""Bridges between a cell and its world's scanner and finger camera, which fail as wires and devices do.
 
 Each is a thread in the tester's process: it passes on what the device says, or is killed (refuses and closes), frozen
 (says nothing), delayed by 2 s of the world's time, or sends garbage. `how` may change at any time; "" is right again.
@@ -52,9 +51,8 @@ class Bridge:
                 self._be_deaf()
                 self._ends.wait(LOOK_S)
                 continue
-            with contextlib.suppress(
-                OSError, InputError
-            ):  # what either side does to its connection, or a world that ends
+            # what either side does to its connection, or a world that ends
+            with contextlib.suppress(OSError, InputError):
                 client, _ = self._hear().accept()
                 with client, socket.create_connection(self._device, 5.0) as device:
                     self._pass_on(client, device)

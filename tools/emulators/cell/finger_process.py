@@ -48,8 +48,10 @@ class PictureStream:
 
     @contextlib.contextmanager
     def client(self) -> Iterator[int]:
-        """A client is connected for the duration of the block; gives the number of the newest part, which may be
-        old."""
+        """A client is connected for the duration of the block.
+
+        Gives the number of the newest part, which may be old.
+        """
         with self._news:
             self._clients += 1
             number = self._number
@@ -108,8 +110,9 @@ def draw(view: TagView, X_FM: Array, noise_grey: float, rng: np.random.Generator
 
 
 def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe; it sends (Unix time s, X_FM (4, 4)) for each exposure, and is
-    told when the picture is shown.
+    """Serve until the world closes its end of the pipe.
+
+    It sends (Unix time s, X_FM (4, 4)) for each exposure, and is told when the picture is shown.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

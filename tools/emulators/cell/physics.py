@@ -78,8 +78,9 @@ class Repeatability:
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
-    """The simulated station of a scenario whose arm stands where its controller has moved it; all else follows from
-    `seed`.
+    """The simulated station of a scenario whose arm stands where its controller has moved it.
+
+    All else follows from `seed`.
 
     Raises:
         InputError: the scenario has no simulated scanner or profiler, or a tool and no workpiece or no finger camera.
@@ -110,8 +111,10 @@ def still(station: Station, q: Array) -> tuple[Simulator, Context]:
 
 
 class Physics:
-    """The plant of the world, advanced by the controller's frames; without a tool nothing touches, and the arm is where
-    it should be."""
+    """The plant of the world, advanced by the controller's frames.
+
+    Without a tool nothing touches, and the arm is where it should be.
+    """
 
     def __init__(self, scenario: Scenario, arm: ArmModel, seed: int, repeatability_mm: float) -> None:
         self.station = true_station(scenario, arm, seed)

@@ -49,36 +49,6 @@ class NoWorld(WeldcalError):
     """The process that plays the world has not begun."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class WiredWorld:
-    """A running world: its process, those of scanner and finger camera, the cell's scenario file, and the file of its
-    truth."""
-
-    process: subprocess.Popen[str]
-    host: str
-    cell: Path
-    truth_file: Path
-    scanner: int
-    finger: int
-    bridges: Mapping[str, Bridge]
-
-    @contextmanager
-    def control(self) -> Iterator[Emulator]:
-        """A connection to the controller's control channel, for one thread."""
-        with _controller(self.process, self.host) as emulator:
-            yield emulator
-
-    def ask(self, **request: Any) -> dict[str, Any]:
-        """One request to the controller's control channel."""
-        with self.control() as controller:
-            return controller.ask(**request)
-
-    def truth(self) -> dict[str, Any]:
-        """The contents of the truth file."""
-        found: dict[str, Any] = json.loads(self.truth_file.read_text(encoding="utf-8"))
-        return found
-
-
 @dataclass(frozen=True)
 class Played:
     """`weldcal emulate-cell` in a process of its own: that process, those of its devices, and the file of its truth."""
@@ -91,6 +61,36 @@ class Played:
         """The contents of the truth file."""
         found: dict[str, Any] = json.loads(self.truth_file.read_text(encoding="utf-8"))
         return found
+
+
+@dataclass(frozen=True)
+class WiredWorld(Played):
+    """A running world with its address, the cell's scenario file and the bridges to its devices."""
+
+    host: str
+    cell: Path
+    bridges: Mapping[str, Bridge]
+
+    @property
+    def scanner(self) -> int:
+        """The process of the scanner."""
+        return self.children[0]
+
+    @property
+    def finger(self) -> int:
+        """The process of the finger camera."""
+        return self.children[-1]
+
+    @contextmanager
+    def control(self) -> Iterator[Emulator]:
+        """A connection to the controller's control channel, for one thread."""
+        with _controller(self.process, self.host) as emulator:
+            yield emulator
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """One request to the controller's control channel."""
+        with self.control() as controller:
+            return controller.ask(**request)
 
 
 @contextmanager
@@ -122,8 +122,9 @@ def played_world(folder: Path, world: str, wires: str, seed: int) -> Iterator[Pl
 
 @contextmanager
 def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
-    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera
-    through bridges, with small scans and a short limit for each.
+    """Play the world at a loopback address for the duration of the block.
+
+    `bridged`: scanner and camera through bridges, with small scans and a short limit for each.
 
     Raises:
         NoWorld: it has not begun.
@@ -145,11 +146,10 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
     small = WORLD.replace(PLAYED_PIXELS, SMALL_PIXELS)
     with contextlib.ExitStack() as stack:
         played = stack.enter_context(played_world(folder, small if bridged else WORLD, wires, seed))
-        process, children = played.process, played.children
         bridges: dict[str, Bridge] = {}
         if bridged:
             trigger, stream = (host, TRIGGER_PORT), (host, STREAM_PORT)
-            clocks = [stack.enter_context(_controller(process, host)) for _ in range(2)]  # one for each thread
+            clocks = [stack.enter_context(_controller(played.process, host)) for _ in range(2)]  # one for each thread
             trigger_clock, stream_clock = (
                 lambda clock=clock: float(clock.ask(ask="time")["timestamp"]) for clock in clocks
             )
@@ -157,15 +157,7 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
             bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream, stream_clock)
             for bridge in bridges.values():
                 stack.callback(bridge.close)
-        yield WiredWorld(
-            process=process,
-            host=host,
-            cell=cell,
-            truth_file=played.truth_file,
-            scanner=children[0],
-            finger=children[-1],
-            bridges=bridges,
-        )
+        yield WiredWorld(played.process, played.children, played.truth_file, host, cell, bridges)
 
 
 @contextmanager

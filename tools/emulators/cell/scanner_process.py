@@ -23,9 +23,8 @@ from weldcal.tools.emulators.cell.physics import still, true_station
 
 POSE, DONE = "pose", "done"  # what the scanner says: it exposes now; its file lies in the folder
 SCAN_S = 0.5  # of the world, from the exposure to the file, at most
-FRAME_WAITS_S = (
-    0.05  # of the host in each frame: the world goes on slowly, and a cell that follows it sees no broken link
-)
+# of the host in each frame: the world goes on slowly, and a cell that follows it sees no broken link
+FRAME_WAITS_S = 0.05
 LIMIT_S = 20.0  # of the host for one scan; a scanner that has stopped is not waited for any longer
 EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
 PROFILED_S = 0.03  # of the copy's time, for a profiler
@@ -94,8 +93,10 @@ class Renderer:
         self._scans = 0
 
     def scan(self, positions: Array) -> Array:
-        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest; a profile is
-        (n, 2) m."""
+        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest.
+
+        A profile is (n, 2) m.
+        """
         self._scans += 1
         plant = self._world.plant
         simulator, context = still(self._station, positions[:6])
@@ -114,8 +115,10 @@ class Renderer:
 
 
 def drop(folder: Path, number: int, points: NDArray[Any], note: Mapping[str, float]) -> Path:
-    """Write a cloud as a program of a real scanner should: the note first, then the cloud under another name, then its
-    name."""
+    """Write a cloud as a program of a real scanner should.
+
+    The note first, then the cloud under another name, then its name.
+    """
     name, suffix = f"scan_{number:04d}", ".npz" if points.shape[-1] == CLOUD else ".npy"
     hidden, path = folder / f".{name}.json.tmp", folder / f"{name}.json"
     hidden.write_text(json.dumps(note), encoding="ascii")
@@ -148,8 +151,10 @@ def run_scanner(setup: ScannerSetup, world: Connection) -> None:
 
 
 def _serve(client: socket.socket, renderer: Renderer, folder: Path, world: Connection, numbers: Iterator[int]) -> None:
-    """Answer the lines of one client until it leaves: `ok N` when the scan of `scan N` lies in the folder, or `error
-    TEXT`."""
+    """Answer the lines of one client until it leaves.
+
+    `ok N` when the scan of `scan N` lies in the folder, or `error TEXT`.
+    """
     client.settimeout(0.2)
     unread = b""
     while True:

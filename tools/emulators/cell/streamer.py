@@ -33,8 +33,10 @@ class Waiter:
         self._unshown = self._gone = False
 
     def send(self, datum: object) -> None:
-        """Send once the last datum is shown; a device that does not answer misses this one, and is not waited for until
-        it does."""
+        """Send once the last datum is shown.
+
+        A device that does not answer misses this one, and is not waited for until it does.
+        """
         with contextlib.suppress(OSError, EOFError):
             if self._unshown and self._pipe.poll(0.0 if self._gone else LIMIT_S):
                 self._pipe.recv()
@@ -58,8 +60,7 @@ class StreamSetup:
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Frame `number`: the plant's positions at the instants of its exposure, its times (s), and whether the stand was
-    knocked before."""
+    """Frame `number`: the plant's positions at its instants, its times (s), and whether the stand was moved before."""
 
     number: int
     instants: tuple[Array, ...]
@@ -103,8 +104,10 @@ class FrameRenderer:
 
 
 def run_stream(setup: StreamSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe; it sends an Exposure when its frame is to arrive, and is told
-    when it is there."""
+    """Serve until the world closes its end of the pipe.
+
+    It sends an Exposure when its frame is to arrive, and is told when it is there.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     renderer = FrameRenderer(setup)
@@ -160,8 +163,7 @@ class Streamer:
             self._waiter.send(self._underway.popleft()[1])  # no frame is late by more than this computer
 
     def truth(self) -> dict[str, object]:
-        """The scanner's clock, what it read (s) at time 0 of the world and how much faster it is, and when its stand
-        was knocked."""
+        """The scanner's clock, its reading (s) at the world's time 0, its rate, and when its stand was moved."""
         t = self._timing
         clock = {"at_0_s": t.device_epoch_s, "rate": 1.0 + 1e-6 * t.device_drift_ppm}
         return {"scanner_clock": clock, "knocked_at_s": self.knocked_at_s}

@@ -252,8 +252,7 @@ def run_world(
     control_port: int = CONTROL_PORT,
     parent: int | None = None,
 ) -> None:
-    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT), or process ``parent``
-    is gone.
+    """Play the world behind a cell's wires until SIGTERM, SIGINT, or the end of process ``parent``.
 
     Args:
         world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from

@@ -17,8 +17,10 @@ TIME, SPEED, TOOL, SILENCE, STREAMED, OUTPUTS = range(6)
 
 
 class Checker:
-    """Points in time are on the host's monotonic clock, which processes on one machine share; durations are the
-    controller's own: its frames, 2 ms each, whatever the host made of them."""
+    """Points in time are on the host's monotonic clock, which processes on one machine share.
+
+    Durations are the controller's own: its frames, 2 ms each, whatever the host made of them.
+    """
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -137,8 +139,10 @@ class Checker:
         }
 
     def output_on_after(self, fault_time: float, output: int) -> dict[str, Any]:
-        """For how long a digital output was on after a point in time (s), and when it was on for the last time (None:
-        never)."""
+        """For how long a digital output was on after a point in time (s), and when for the last time.
+
+        The last time is None where it was never on.
+        """
         rows = self._rows()
         rows = rows[rows[:, TIME] >= fault_time]
         on = (rows[:, OUTPUTS].astype(np.int64) >> output & 1).astype(bool)

@@ -178,16 +178,9 @@ def emulator_process(
     *,
     host: str | None = None,
     control_port: int = CONTROL_PORT,
-    polyscope: str = "5.21",
-    robot: str = "ur10e",
     q: Sequence[float] | None = None,
-    safety_limits: str = "",
-    operational_mode: str = "none",
-    kinematics: Path | None = None,
-    pace: float = 1.0,
-    lockstep: float = 0.0,
-    seed: int = 0,
     wait_for_lock_s: float = 120.0,
+    **options: Any,
 ) -> Iterator[Emulator]:
     """An emulator that listens, under the lock that keeps its address's ports for one owner at a time.
 
@@ -197,16 +190,9 @@ def emulator_process(
     Args:
         host: the loopback address, each with its own lock; None: one that nobody uses.
         control_port: port of the control channel.
-        polyscope: controller version, such as 5.12, 5.21 or 10.7.
-        robot: name of the arm.
         q: joint angles at the start (6,) (rad); the emulator's home where None.
-        safety_limits: six joint ranges "LOWER:UPPER,..." (deg) that are reported and obeyed; the arm's own where "".
-        operational_mode: none, manual or automatic.
-        kinematics: a robot's factory calibration; nominal where None.
-        pace: controller seconds per host second, 0.05 to 1.
-        lockstep: for so long (s of the host) its time waits for a client that streams and is late; 0: never.
-        seed: everything random follows from it.
         wait_for_lock_s: how long to wait for another owner of `host` to finish (s).
+        options: polyscope, robot, safety_limits and others of `run_emulator`; one that is None is left out.
 
     Raises:
         InputError: the lock or a port is taken, or an argument is not one.
@@ -214,19 +200,10 @@ def emulator_process(
     ports = (*PORTS, control_port)
     with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
         command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
-        given = {
-            "control-port": control_port,
-            "polyscope": polyscope,
-            "robot": robot,
-            "pace": pace,
-            "lockstep": lockstep,
-        }
-        given |= {"seed": seed, "safety-limits": safety_limits, "operational-mode": operational_mode}
-        command += [f"--{name}={value}" for name, value in given.items()]
+        options |= {"control_port": control_port}
+        command += [f"--{name.replace('_', '-')}={value}" for name, value in options.items() if value is not None]
         if q is not None:
             command += ["--q", *(repr(float(angle)) for angle in q)]
-        if kinematics is not None:
-            command += ["--kinematics", str(kinematics)]
         emulator = _started(command, address, control_port)
         try:
             yield emulator

@@ -44,8 +44,7 @@ Happens = Callable[[], object]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of run: scenario, overrides, the robot (simulated, emulated or wired), and a fault at the begin of a
-    phase."""
+    """A kind of run: scenario, overrides, robot (simulated, emulated, wired), and a fault as a phase begins."""
 
     scenario: str
     overrides: str
@@ -193,8 +192,7 @@ _TURNS: list[Semaphore] = []  # of a measuring process: one for each side
 
 
 def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tuple[dict[str, object], str]:
-    """Pairs of one run (the S groove, 30 mm of seam), one of each pair recorded: the JSON object, and a table in
-    Markdown.
+    """Run pairs (S groove, 30 mm), one of each recorded; return the JSON object and a table in Markdown.
 
     Computing time (all threads of a process, s) of whole runs, reports included, is compared. The two runs of a pair
     take turns of one simulated second: a host that works for others too changes its speed by a third within minutes,
@@ -231,8 +229,7 @@ def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tup
 
 
 def overhead(seconds: np.ndarray) -> dict[str, float]:
-    """By how many percent the second column (n,2) is longer than the first: the median of the pairs, and its interval
-    of at least 95 %.
+    """Compute by how many percent column 2 of (n,2) is longer: median and its interval of at least 95 %.
 
     A disturbance of the host makes single runs longer: the median and its interval (order statistics) bear that.
     """
@@ -266,8 +263,7 @@ def _pair(
 
 
 def _in_turns(side: int, folder: Path, seed: int) -> tuple[float, float, float]:
-    """One run that works only in its turns; side 1 is recorded: computing time s, size of the recording MB, the run's
-    own length s."""
+    """Run only in its turns; side 1 is recorded. Returns computing time s, recording MB, and the run's s."""
     mine, others = _TURNS[side], _TURNS[1 - side]
 
     def hand_over(*_: object) -> None:

@@ -22,8 +22,8 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import subplots, svg
-from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics, write_atomic
+from weldcal.tools.studies.harness import Figures, Results, Row, Study
 from weldcal.tools.worlds import wrong_models
 from weldcal.tools.worlds.arm_cells import calibrate_cell
 from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
@@ -47,11 +47,13 @@ Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
-    """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region
-    of X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both
-    means over the runs, with the noise of the held-out scan in both (NaN where that was not looked at). ``corrected``:
-    with a scanner that is off in scale and gradient, and its correction; ``warped``: with one that errs by another
-    model."""
+    """How often ``runs`` calibrations from ``poses`` observations have the truth in the stated 95 % region.
+
+    Of X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both
+    means over the runs, with the noise of the held-out scan in both (NaN where that was not looked at).
+    ``corrected``: with a scanner that is off in scale and gradient, and its correction; ``warped``: with one that
+    errs by another model.
+    """
 
     poses: int
     runs: int
@@ -207,9 +209,10 @@ def honesty(
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
-    """Of ``runs`` worlds of one class (scans, largest error of the scanner m, rms error of the arm m, with a local
-    field or plain): mean error (m) of 60 new scans each, and how many times that is stated (nested held-out errors,
-    both means over the worlds).
+    """Mean error (m) of 60 new scans in each of ``runs`` worlds of one class, and how many times it is stated.
+
+    A class is scans, largest error of the scanner m, rms error of the arm m, with a local field or plain. The ratio
+    is of nested held-out errors, both means over the worlds.
     """
 
     poses: int
@@ -222,8 +225,7 @@ class Stated:
 
 
 def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: bool) -> Stated:
-    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on scans that it has not
-    seen."""
+    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on new scans."""
     stated, true = [], []
     for device in range(runs):
         observations, patterns = wrong_models.warped_observations(device, poses, 0, warp_m, arm_m)

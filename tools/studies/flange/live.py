@@ -29,9 +29,10 @@ TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
 
 @dataclass(frozen=True, kw_only=True)
 class LiveRow:
-    """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate
-    expected of the former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with
-    noise redrawn.
+    """One seed: scans used, error at the work point (m) and of the rotation (rad), and what was expected.
+
+    Expected by the estimate (rms), the least that these poses, arm and scanner allow (rms), and the same
+    calibration with noise redrawn.
     """
 
     seed: int
@@ -45,8 +46,7 @@ class LiveRow:
 
 
 def live_scenario(repeatability_mm: float, scans: int) -> Scenario:
-    """The calibration scenario with an arm that repeats no better, a scanner without distortion, and exactly so many
-    scans."""
+    """Make the scenario with an arm that repeats no better, an undistorted scanner, and exactly so many scans."""
     scenario = perfect(load_scenario(SCENARIO))
     assert isinstance(scenario.robot, SimulatedUr)
     scenario.robot.repeatability_mm = repeatability_mm
@@ -64,8 +64,7 @@ def study_live(
     redraws: int = 0,
     progress: Progress = no_progress,
 ) -> list[LiveRow]:
-    """Calibrate live, through the whole Diagram, once for each seed, and ``redraws`` times more from the same poses
-    without it.
+    """Calibrate through the whole Diagram once a seed, and ``redraws`` times from the same poses without it.
 
     Raises InputError for numbers that no cell takes, and RuntimeError where a job was held.
     """
@@ -102,8 +101,7 @@ def study_live(
 
 
 def live_picture(rows: list[LiveRow]) -> bytes:
-    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise redrawn, and at the
-    bound."""
+    """Draw the share of calibrations with no larger error: live (steps), noise redrawn, and at the bound."""
     again = joined([r.redrawn for r in rows])
     mm, deg = 1e3, float(np.degrees(1.0))
     figure, axes = subplots(8.2, 3.6, 1, 2, sharey=True)

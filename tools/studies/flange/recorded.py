@@ -30,8 +30,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Figures, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.studies.harness import Figures, Row, Study
 
 PARTS_OF_A_CLOUD = (2, 4, 8)
 _REACH_M = 0.0015  # about an edge, in which its blur shows
@@ -150,9 +150,10 @@ def usable_scans(
 
 @dataclass(frozen=True)
 class Draws:
-    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad; NaN where no normals are known) of
-    every draw on the scans that it did not use, how many were refused, and the share of the others that corrected the
-    scanner."""
+    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad) on the unused scans.
+
+    NaN where no normals are known; how many were refused, and the share of the others that corrected the scanner.
+    """
 
     scans: int
     position_m: Array

@@ -1,5 +1,4 @@
-"""Studies on ray-cast frames: flanges found and imagined, half-hidden flanges, and the rotation of filled hole
-patterns."""
+"""Study ray-cast frames: flanges found and imagined, half-hidden ones, and the turn of filled hole patterns."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,8 +16,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, statistics
+from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
 from weldcal.tools.worlds.flange_frames import WAYS, empty_frame, fit_frame, flange_frame, hidden_frame
 
 WidthOption = Annotated[int, option("--width", "PX", "Width of the PhoXi M images; 2064 is the full width.", min=200)]
@@ -157,8 +156,7 @@ def hidden(
 
 
 def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], name: str) -> Mapping[str, object]:
-    """The rotation of the hole pattern in one scan with these openings filled: "none", "open", "right" or "wrong" (over
-    10 degrees)."""
+    """Find the hole pattern's turn with these openings filled: "none", "open", "right" or "wrong" (over 10 deg)."""
     scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
     frame = flange_frame(scanner, _with_filled(standard, filled), np.random.default_rng(list(rng)))
     assert frame.X_CR is not None

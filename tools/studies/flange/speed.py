@@ -152,8 +152,7 @@ def _ransac(points: Array, seed: int) -> Array | None:
 
 
 def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
-    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search:
-    library calls all through."""
+    """Find the circle by library calls: depth gate, outlier removal, planes, clusters, circle search."""
     p = frame.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
     p = p[np.abs(p[:, 2] - depth_m) < 0.04]

@@ -26,8 +26,7 @@ MARGIN = 0.02  # by which a method must be better to count as ahead
 
 
 def _ahead(results: Results) -> Figures:
-    """In how many of a hundred cells some OpenCV method is ahead in a column by more than MARGIN, and the 95th
-    percentile of the ratio."""
+    """Count cells of a hundred in which OpenCV is ahead in a column by MARGIN; also the ratio's 95th percentile."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for name, cell in results.items():
         found.setdefault(name.rpartition(", cell ")[0], []).append(cell)

@@ -1,5 +1,4 @@
-"""Hand-eye solvers on public data beside OpenCV, and in simulation: outliers, invariance, uncertainty, AXB = YCZ,
-speed."""
+"""Compare hand-eye solvers with OpenCV on public data and in simulation."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -11,18 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
+from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, full_problem, linearise
-from weldcal.calibration.hand_eye.solve import (
-    HandEyeConfig,
-    as_transform,
-    pose_difference,
-    solve_axb_ycz,
-    solve_problem,
-)
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, pose_difference, solve_axb_ycz, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
@@ -67,8 +60,7 @@ class DatasetRow:
 
     @property
     def holds(self) -> bool:
-        """Whether no OpenCV method is ahead in a column by more than 2 % beyond chance; never where OpenCV was left
-        out."""
+        """Whether OpenCV is nowhere ahead in a column by more than 2 % beyond chance; never without OpenCV."""
         return all(
             ours <= theirs * (1.0 + _SHARE) or low <= 1.0 + _SHARE
             for ours, theirs, low in ((self.deg, self.best_deg, self.low_deg), (self.mm, self.best_mm, self.low_mm))
@@ -146,8 +138,7 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
 
 
 def lowest_ratio(ours: Array, theirs: Array, seed: int = 0) -> float:
-    """Lower end of the 95 % interval of the ratio of two rms errors, by 4,000 paired resamples of the poses
-    (bootstrap)."""
+    """Bound the ratio of two rms errors from below (95 %), by 4,000 paired resamples of the poses."""
     drawn = np.random.default_rng(seed).integers(len(ours), size=(4000, len(ours)))
     ratio = np.sqrt((ours[drawn] ** 2).mean(axis=1) / (theirs[drawn] ** 2).mean(axis=1))
     return float(np.quantile(ratio, 0.025))
@@ -223,8 +214,10 @@ def invariance(seed: int = 0) -> float:
 
 
 def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]:
-    """AXB = YCZ with 30 poses, 0.1 mm and 0.02 degrees: how many random starts end within twice the Cramer-Rao bound in
-    all three unknowns, the worst error, and the rms error over all starts, both in units of the bound.
+    """Solve AXB = YCZ with 30 poses, 0.1 mm and 0.02 degrees, from random starts.
+
+    Returns how many end within twice the Cramer-Rao bound in all three unknowns, the worst error, and the rms error
+    over all starts, both in units of the bound.
 
     The error of an unknown is the root of its squared error in units of the bound's covariance, per number. (An error
     norm compared with the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
@@ -249,8 +242,7 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
 
 
 def degenerate(seed: int = 0) -> dict[str, str]:
-    """What is said of motions that cannot determine the answer: an error by its name, or the direction left open;
-    "answer" where a number came without a warning."""
+    """Return the error or open direction named for undetermined motions; "answer": a number without a warning."""
     rng = np.random.default_rng(seed)
     problem, truth = simulated("eye_in_hand", 20, rng, float(np.radians(0.05)), 2e-4)
     X, Y = truth["X"], truth["Y"]
@@ -285,8 +277,10 @@ def degenerate(seed: int = 0) -> dict[str, str]:
 
 
 def speed(n: int = 200, repeats: int = 7, peers: int = 3) -> dict[str, float]:
-    """Milliseconds of processor time that each method takes for ``n`` poses in this process, best of ``repeats``, and
-    of ``peers`` for OpenCV: what else runs on the machine does not count."""
+    """Time each method for ``n`` poses in this process: ms of processor time, best of ``repeats``.
+
+    It is best of ``peers`` for OpenCV. What else runs on the machine does not count.
+    """
     problem, _ = simulated("eye_in_hand", n, np.random.default_rng(0), float(np.radians(0.05)), 2e-4)
     tasks: dict[str, Callable[[], object]] = {"weldcal": lambda: solve_problem(problem, config=_PLAIN)}
     tasks |= {m: partial(opencv_solve, m, problem.F, problem.G) for m in METHODS}
@@ -304,8 +298,11 @@ def speed(n: int = 200, repeats: int = 7, peers: int = 3) -> dict[str, float]:
 def run_hand_eye_benchmark(
     data: Path | None, *, quick: bool = False, seed: int = 0, progress: Progress = no_progress
 ) -> HandEyeBenchmark:
-    """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and
-    no OpenCV on the sets, for a test. Raises InputError, before any work, where the folder holds no set."""
+    """Run all of it.
+
+    ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and no OpenCV on the
+    sets, for a test. Raises InputError, before any work, where the folder holds no set.
+    """
     from weldcal.calibration.hand_eye.pairs.files import read_pairs
 
     report = HandEyeBenchmark()

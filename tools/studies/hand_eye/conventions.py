@@ -1,5 +1,4 @@
-"""How often the data choose the right reading of two lists of poses, and how often a right reading is rejected by
-chance."""
+"""Count how often data choose the right reading of two pose lists, and reject a right one by chance."""
 
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
@@ -25,8 +24,7 @@ _FEW = (6, 10, 20)
 
 
 def conventions(kind: str, seed: int, n: int = 0, runs: int = 0) -> Mapping[str, object]:
-    """One set of two lists in random conventions, or ``runs`` tests of readings that are equally right, of ``n``
-    poses."""
+    """Read one set in random conventions, or test ``runs`` readings that are equally right, of ``n`` poses."""
     rng = np.random.default_rng(seed)
     return _chosen(written_set(rng)) if kind == "set" else _tail(rng, n, runs)
 
@@ -67,8 +65,7 @@ def _near(found: ReadingDecision, case: WrittenSet) -> bool:
 
 
 def _tail(rng: np.random.Generator, n: int, runs: int) -> Mapping[str, object]:
-    """How often the residuals of one of two right readings exceed the other's by the limit of each chance, rotations
-    and positions."""
+    """Count how often one of two right readings exceeds the other by each limit, in rotations and positions."""
     counts, compared = np.zeros(len(TAILS), dtype=int), 0
     for _ in range(max(runs // _BLOCK, 1)):
         turned = Rotation.from_rotvec(rng.normal(size=(n, 3)) * 0.5)

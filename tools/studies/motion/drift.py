@@ -28,11 +28,13 @@ _CREEP_START_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class DriftTrial:
-    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was
-    measured. ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames
-    of the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
+    """One recording with one change: what, when found (s after it; NaN: not), and how well measured.
+
+    ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of
+    the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
     threshold; ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
-    change was, in the same units."""
+    change was, in the same units.
+    """
 
     kind: str
     seed: int
@@ -207,8 +209,11 @@ def quiet_hours(world: WorldConfig, hours: float, seed: int) -> tuple[list[Drift
 def _watched(
     config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
 ) -> tuple[list[DriftEvent], Array, float, float]:
-    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m,
-    rotation rad): to a test that knows everything else, and to one that knows what the monitor does."""
+    """Return events of a recording, the line of sight in the base, and what its frames show of a change.
+
+    The change is (time s, shift m, rotation rad); shown to a test that knows everything else, and to one that knows
+    what the monitor does.
+    """
     w = simulate(config, duration_s, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
     before: DriftFilter | None = None
@@ -222,8 +227,7 @@ def _watched(
 
 
 def expected_late(knocks: Sequence[DriftTrial]) -> float:
-    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the
-    noise alone."""
+    """Count changes that noise alone hides for WITHIN_S from a test of three unknowns that knows their times."""
     threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
     return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
 
@@ -246,8 +250,10 @@ def _without_clock(information: Array) -> Array:
 
 
 def _shown(w: FeatureWorld, test: DriftTest, change: tuple[float, Array, Array]) -> float:
-    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where
-    noise and all other errors are known exactly and the clock alone is not."""
+    """Compute the expected statistic of a pure shift or turn by the frames of WITHIN_S, over its threshold.
+
+    Noise and all other errors are known exactly, and the clock alone is not.
+    """
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -261,8 +267,7 @@ def _shown(w: FeatureWorld, test: DriftTest, change: tuple[float, Array, Array])
 
 
 def _told(w: FeatureWorld, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
-    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time
-    exactly."""
+    """Compute it with all other errors known as by the monitor's filter ``before`` the change, and its time."""
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -279,8 +284,10 @@ def _told(w: FeatureWorld, test: DriftTest, before: DriftFilter, change: tuple[f
 
 
 def found_by_angle(trials: Sequence[DriftTrial]) -> list[dict[str, float]]:
-    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within
-    WITHIN_S, and the median of what the frames show."""
+    """Group turns by the angle of their axis to the line of sight.
+
+    How many there were, the share found within WITHIN_S, and the median of what the frames show.
+    """
     turns = [t for t in trials if t.kind == "turn"]
     angles = np.degrees(np.arccos(np.clip([t.along_view for t in turns], 0.0, 1.0)))
     rows = []

@@ -43,8 +43,7 @@ _SECONDS = 14.0  # of the history that a reader can still follow
 
 
 def track_picture(scanner: Array, robot: Array, robot_at_arrival: Array) -> bytes:
-    """Fig. 5: the flange's centre (N, 3) m by the scanner, and by the robot at the capture and, for comparison, at the
-    arrival, in x-y and x-z."""
+    """Draw Fig. 5: the flange's centre (N, 3) m by scanner and robot, at capture and arrival, in x-y and x-z."""
     figure = Figure(figsize=(9.0, 4.4), layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
         for p, marker, colour, size, label in (
@@ -70,8 +69,7 @@ def _components(axes: Axes, t: Array, errors: Array, first: int) -> None:
 
 
 def history_picture(t: Array, before: Array, after: Array) -> bytes:
-    """Fig. 6: components (N, 6) of the calibration's error by ICP over time (N,) s, before and after
-    synchronisation."""
+    """Draw Fig. 6: the error (N, 6) by ICP over time (N,) s, before and after synchronisation."""
     figure, every = subplots(9.0, 6.0, 2, 2, sharex=True, sharey="row")
     both = (("poses at arrival", before), ("joint estimate of X_BC and clock", after))
     for column, (title, errors) in enumerate(both):
@@ -376,8 +374,10 @@ def _compensation(
     X_raw: RigidTransform,
     X_found: RigidTransform,
 ) -> dict[str, dict[str, float]]:
-    """Rms ICP displacement (mm) before and after X_BC is right-multiplied by the mean error matrix (Eq. 21); the matrix
-    comes from every other frame, the errors from the frames between."""
+    """Compute the rms ICP displacement (mm) before and after X_BC is multiplied by the mean error (Eq. 21).
+
+    The matrix comes from every other frame, the errors from the frames between.
+    """
     out = {}
     for name, X, poses in (
         ("SVD, poses at arrival", X_raw, at_arrival),
@@ -403,8 +403,7 @@ def _quality(
     fits: dict[str, FlangeFit],
     found: MotionEstimate,
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
-    """Fig. 9: the fastest frame that the estimate used, and a static scan at the same place; faces (N, 3) mm in the
-    flange's axes."""
+    """Compare the fastest frame used with a static scan there (Fig. 9); faces (N, 3) mm in the flange's axes."""
     k = int(np.argmax(np.where(found.inliers, found.speed, -np.inf)))
     q = world.joints(float(found.capture[k]) - world.options.robot_start_s)
     still = static.look(q, np.random.default_rng(9))

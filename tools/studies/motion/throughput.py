@@ -46,8 +46,10 @@ _PAPER = "10 million points per second arrive; real-time processing is left to p
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Throughput:
-    """Frames offered, estimated, without a fit and dropped in ``seconds``; times from arrival to estimate (ms); how
-    late the arm's 500 Hz loop ran (ms)."""
+    """Frames offered, estimated, without a fit and dropped in ``seconds``, and times in ms.
+
+    Times from arrival to estimate, and how late the arm's 500 Hz loop ran.
+    """
 
     pixels: int
     seconds: float

@@ -1,5 +1,4 @@
-"""`weldcal benchmark whole-body`: the tracking error of the flange beside that of a wrist link, by its mesh and by a
-fused model."""
+"""Compare tracking errors of the flange and of a wrist link, by its mesh and by a fused model."""
 
 import tempfile
 from dataclasses import replace

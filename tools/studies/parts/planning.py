@@ -1,5 +1,4 @@
-"""Plans seams from one scan, by drawing and from the cloud alone: every scanner preset in random poses, and hard
-cases."""
+"""Plan seams from one scan, by drawing and from the cloud: every scanner in random poses, and hard cases."""
 
 import math
 import time
@@ -102,8 +101,10 @@ def _rms(values: Any) -> float:
 
 
 def plan_rows(plans: list[Plan], key: str) -> dict[str, str]:
-    """A line per preset or kind of trouble (``key``) and method: planned of all, errors sideways (rms and worst), sigma
-    stated; of the presets CPU seconds, of the troubles how many are as they have to be."""
+    """Make a line per preset or trouble (``key``) and method: planned of all, errors sideways, sigma stated.
+
+    Errors are rms and worst; of the presets CPU seconds, of the troubles how many are as they have to be.
+    """
     rows: dict[str, str] = {}
     for name, method in dict.fromkeys((t[key], t["method"]) for t in plans):
         mine = [t for t in plans if (t[key], t["method"]) == (name, method)]

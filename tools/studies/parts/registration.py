@@ -114,16 +114,14 @@ def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
 
 
 def _off(line_P: Floats, found: PartRegistration, scene: PartScene, part: Subject) -> Floats:
-    """How far each point of a planned line is from the true seam, mm; a seam that a turn maps to itself is compared as
-    a set."""
+    """Measure how far planned points are from the true seam, mm; a symmetric seam is compared as a set."""
     true = part.seam.transformed(scene.X_BP).points_P
     R = found.X_BP.rotation().matrix()
     return 1e3 * np.asarray(cKDTree(true).query(line_P @ R.T + found.X_BP.translation())[0])
 
 
 def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float:
-    """The pose's error squared in units of its covariance, the least over the turns that change neither part nor
-    seam."""
+    """Compute the NEES of the pose, the least over the turns that change neither part nor seam."""
     model = PartModel(part.mesh)
     p = model.points[::20]
     same = [RigidTransform()]
@@ -165,8 +163,7 @@ def run_registration_study(
     names: Sequence[str] | None = None,
     progress: Progress = no_progress,
 ) -> Mapping[str, object]:
-    """Run scenes with clutter (a seed each), plans (every part once a seed) and subjects to refuse; registrations.csv
-    grows.
+    """Run scenes with clutter, plans of every part, and subjects to refuse; registrations.csv grows.
 
     Returns counts, worst figures and the verdict: done when nothing was wrong and the plans are within their targets.
     """

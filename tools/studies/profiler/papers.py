@@ -53,8 +53,7 @@ PRINTED_RADIUS = {
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeRow:
-    """One set, number of rotations and method: rms errors over the trials, and the paper's own three criteria (mm,
-    deg)."""
+    """One set, rotations and method: rms errors over the trials, and the paper's three criteria (mm, deg)."""
 
     name: str
     rotations: int
@@ -121,8 +120,7 @@ def edge_rows(
 
 
 def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple[float, float, float, float]:
-    """Mean and std of d alpha (deg; vectors from the first point of a group, unsigned) and of d (mm), the paper's
-    section 4.1."""
+    """Compute mean and std of d alpha (deg, unsigned, from a group's first point) and d (mm), section 4.1."""
     p_F = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ R.T + t
     at = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation
     group = at.reshape(-1, TRANSLATIONS, 3)
@@ -169,8 +167,10 @@ HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WorldResult:
-    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and of the
-    frustum the mean error (2,) of the slanted edges (mm) and of the slopes (deg)."""
+    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features.
+
+    Of the frustum the mean error (2,) of the slanted edges (mm) and of the slopes (deg).
+    """
 
     world: int
     method: str

@@ -163,8 +163,7 @@ def _outliers(folder: Path) -> Iterator[Target]:
 
 
 def _degenerate(folder: Path) -> Iterator[Target]:
-    """Sets that leave something open: how many answers were wrong and did not say so, by their covariance where they
-    have one."""
+    """Count wrong answers to undetermined sets that do not say so, by their covariance where they have one."""
     with np.load(folder / "edge_features.npz") as d:
         truth = EdgeState(d["truth_Rs"], d["truth_Ts"] * MM, d["truth_p0"] * MM, d["truth_e"])
         sets = {name: [d[f"degen_{name}_{part}"] for part in ("Rb", "Tb", "ps")] for name in DEGENERATE}
@@ -202,8 +201,7 @@ def _raw(folder: Path) -> Iterator[Target]:
 
 
 def published_lines(sphere: list[WorldResult]) -> Iterator[Target]:
-    """Of the study's worlds: the sphere paper's own method must be that method: its figures on these files are
-    known."""
+    """Check that the sphere paper's own method gives its known figures on the study's worlds."""
     for method, known in PUBLISHED.items():
         mean = float(np.mean([r.points_mm.mean() for r in sphere if r.method == method]))
         yield Target(f"sphere, the paper's method, {method}: off its known {known} mm", "mm", abs(mean - known), 0.01)
@@ -326,8 +324,11 @@ def _missed(figures: Figures) -> list[Target]:
 
 
 def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
-    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations, as printed for its three objects and of every set and
-    method; and the calibration's own error, which those criteria hardly show."""
+    """Make tables 1 to 3 of the edge paper, over 10 to 25 rotations.
+
+    As printed for its three objects and of every set and method; and the calibration's own error, which those
+    criteria hardly show.
+    """
     n = papers.COUNTS
     by = {(r.name, r.method, r.rotations): r for r in rows}
     names = list(dict.fromkeys(name for name, _, _ in by))

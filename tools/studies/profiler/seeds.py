@@ -137,37 +137,13 @@ def over_seeds(results: Results) -> bytes:
     picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
     axes = picture.add_subplot()
     for k, n in enumerate(lines):
-        axes.plot(
-            n["values"] / n["target"],
-            np.full(len(n["values"]), k),
-            "o",
-            ms=4,
-            mew=0,
-            alpha=0.5,
-            color=OURS,
-            label="one seed" if k == 0 else None,
-        )
-        low, high = np.nanmin(n["bounds"]) / n["target"], np.nanmax(n["bounds"]) / n["target"]
-        axes.plot(
-            [low, high],
-            [k + 0.28] * 2,
-            "-",
-            lw=3,
-            color="0.45",
-            solid_capstyle="round",
-            label="its bound, over the seeds" if k == 0 else None,
-        )
+        seed, bound, files = ("one seed", "its bound, over the seeds", "the fixed files") if k == 0 else (None,) * 3
+        shares, places = n["values"] / n["target"], np.full(len(n["values"]), k)
+        axes.plot(shares, places, "o", ms=4, mew=0, alpha=0.5, color=OURS, label=seed)
+        ends = [np.nanmin(n["bounds"]) / n["target"], np.nanmax(n["bounds"]) / n["target"]]
+        axes.plot(ends, [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round", label=bound)
         if n["fixed_files"] is not None:
-            axes.plot(
-                n["fixed_files"] / n["target"],
-                k,
-                "D",
-                ms=5,
-                mfc="none",
-                mec="black",
-                mew=1.4,
-                label="the fixed files" if k == 0 else None,
-            )
+            axes.plot(n["fixed_files"] / n["target"], k, "D", ms=5, mfc="none", mec="black", mew=1.4, label=files)
     axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
     axes.set_yticks(range(len(lines)), [f"{n['what']}, {n['target']:g} {n['unit']}" for n in lines], fontsize=8)
     axes.invert_yaxis()
@@ -284,8 +260,7 @@ def predicted_mm(
 
 
 def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[str, Floats]:
-    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has
-    them."""
+    """Predict `points` (), `seam` (3,) mm and `boss` (2,) mm and deg by the bound, where the world has them."""
     data, tests = world.trial.data, world.trial.tests
     assert data.arm is not None
     assert tests is not None

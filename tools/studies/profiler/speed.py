@@ -112,8 +112,7 @@ def _row(
     solve: Callable[[EdgeTrial], Answer | None],
     best: list[Answer] | None,
 ) -> dict[str, Any]:
-    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found,
-    rms error."""
+    """Time a method on sets: wall and processor s (median, largest), how often it found the optimum, rms error."""
     seconds, worked, errors, found = [], [], [], 0
     for k, trial in enumerate(trials):
         start, begun = time.perf_counter(), time.process_time()
@@ -180,8 +179,7 @@ def _paper_pairs(t: EdgeTrial) -> Answer:
 
 
 def _searched(t: EdgeTrial) -> Answer:
-    """Distance to the best line on a grid of rotations and translations, SciPy from the twenty best, the best one
-    polished."""
+    """Search a grid of rotations and translations for the best line, SciPy from the twenty best, polish one."""
     p_S = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]])
     axis = np.linspace(-GRID_REACH_M, GRID_REACH_M, GRID_STEPS)
     shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -12,8 +12,7 @@ from weldcal.tools.cli.options import Outcome as Printed
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.harness import statistics
+from weldcal.tools.report.render import statistics, write_atomic
 from weldcal.tools.studies.robot.stream import TRANSPORT, jobs, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
@@ -56,8 +55,7 @@ class FaultReport:
     sequences: list[FaultSequence]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are
-        not as required."""
+        """Return the JSON object: ms, and mm of the tool, from the fault on; `wrong` names unmet requirements."""
         stopped = [outcome for outcome in self.outcomes if outcome.did == "stopped"]
         wrong = [{"id": o.name, "reason": "; ".join(o.problems)} for o in self.outcomes if not o.ok]
         wrong += [{"id": f"sequence {s.seed}", "reason": s.verdict} for s in self.sequences if not s.ok]

@@ -101,9 +101,9 @@ class StreamReport:
             "velocity_steps": len(tap.motions),
             "state_age_ms": _spread(np.array(tap.ages)),
             "state_reads": len(tap.ages),
-            "worker_worst_period_ms": 1e3 * self.final.worst_period_s,
+            "worker_worst_period_ms": 1e3 * self.final.worst_period,
             "worker_late_periods": self.final.late_periods,
-            "clock_residual_ms": 1e3 * self.final.clock_residual_s,
+            "clock_residual_ms": 1e3 * self.final.clock_residual,
             "clock_drift_ppm": 1e6 * self.final.clock_drift,
             "diagram_late_ms": 1e3 * self.clock.late_s,
             "diagram_reanchored": self.clock.reanchored,
@@ -285,8 +285,7 @@ class JobsReport:
         return Lateness([int(count) for count in counts], max(job.lateness.worst_ms for job in self.jobs))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object; `over_8_ms` counts velocities, `limits_ms` are those of the bins of `velocities` and of the
-        host's wake-ups."""
+        """Return the JSON object; `over_8_ms` counts velocities, `limits_ms` bound the bins."""
         late = self.lateness
         return {
             "state": "done",

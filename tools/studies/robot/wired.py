@@ -1,5 +1,4 @@
-"""Faults of the devices by wire, in each phase of the job, and long runs with random ones: memory, names, motion and
-arc."""
+"""Inject faults of the devices by wire in each phase of the job, and in long runs."""
 
 import ctypes
 import dataclasses as dc
@@ -102,8 +101,7 @@ def _processes(world: WiredWorld) -> dict[str, object]:
 
 
 def _return_free_memory() -> None:
-    """Let the C library give what is free back to the system: else resident memory is the largest that any cycle
-    needed."""
+    """Give free memory of the C library back to the system; else resident memory is the largest ever needed."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only the GNU library has it
     if trim is not None:
         trim(0)
@@ -116,8 +114,7 @@ class _Mallinfo2(ctypes.Structure):
 
 
 def _in_use_mb() -> float:
-    """What this process has allocated from the GNU C library and from Python and not freed, MB, at most; NaN for
-    another library."""
+    """Read what this process has allocated from glibc and Python and not freed, MB; NaN for another library."""
     ask = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if ask is None:
         return float("nan")
@@ -157,8 +154,7 @@ def _alive(pid: int) -> bool:
 
 
 def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool | None]:
-    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not
-    shown.
+    """Fit the slope of a memory (MB/h) with its 95 % interval; `flat`: growth above FLAT_MB_H is not shown.
 
     None where the cycles after the warm-up are fewer than FEWEST, or within SHORTEST_H.
 

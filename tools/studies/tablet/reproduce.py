@@ -76,8 +76,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class SignRow:
-    """Hand positions against the tablet alone, no camera: rms per axis (mm) and leave-one-out mean (mm) for one
-    sign."""
+    """Hand positions against the tablet alone for one sign: rms per axis and leave-one-out mean (mm)."""
 
     sign: Sign
     rigid_mm: float
@@ -87,8 +86,7 @@ class SignRow:
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model on the published data: unknowns, mean error of the hand in sample and left out, largest left out
-    (mm)."""
+    """One model on the published data: unknowns, mean error in sample and left out, largest left out (mm)."""
 
     name: str
     unknowns: int
@@ -205,8 +203,7 @@ def compare_models(touches: TabletTouches) -> tuple[ModelRow, ...]:
 
 
 def two_stage_errors(touches: TabletTouches, keep: NDArray[np.bool_], sign: Sign) -> tuple[Array, Array]:
-    """Hand errors (n, 2) m of the paper's stage 1 and of both its stages, fitted to some landmarks, at all of them,
-    against their own r' (Eq. 20)."""
+    """Compute hand errors (n, 2) m of stage 1 and of both stages at all landmarks, against their r' (Eq. 20)."""
     fitted = touches.pick(keep)
     first, second = _two_stages(fitted, sign)
     target = touches.hand_m + 1e-3 * sign * place_landmarks(touches, first, "htm").correction[0]
@@ -457,8 +454,7 @@ def _table(r: Reproduced) -> dict[str, object]:
 
 
 def sign_residuals(touches: TabletTouches) -> bytes:
-    """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss
-    them."""
+    """Draw for each sign of Eq. 20 the hand positions, and how far a similarity of tablet and pen misses them."""
     picture, every = subplots(9.6, 3.0, 1, 3, sharex=True, sharey=True)
     for axes, sign in zip(every, Sign, strict=True):
         points = touches.pitch_m * (touches.landmark_px - sign * touches.delta_px)

@@ -345,8 +345,7 @@ class TurnResult:
 
 
 def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
-    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in
-    pieces."""
+    """Predict and weld one seam with one chord by the nominal budget's plan; what is refused is done in pieces."""
     case = WeldCase(seam, chord_m=chord_m)
     config = study_config(case)
     true = get_seam(seam)

@@ -55,8 +55,10 @@ def weld(
 def run_study(
     folder: Path, names: tuple[str, ...], count: int, first: int, quick: bool, progress: Progress
 ) -> Measured:
-    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on; write the tables, runs.csv,
-    and one CSV and two pictures per pictured run."""
+    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on.
+
+    Writes the tables, runs.csv, and one CSV and two pictures per pictured run.
+    """
     start = time.monotonic()
     everything = not names
     rows = get_rows(names)
@@ -202,8 +204,7 @@ def _first_stop(row: RowResult) -> str:
 
 
 def compared_lines(results: Iterable[CaseResult]) -> list[tuple[str, ...]]:
-    """The laws in comparison: seam, law, mean, largest, peak turning rate, speed range, weld outside the band,
-    completed."""
+    """Compare the laws: seam, law, mean, largest, peak turn rate, speed range, weld outside the band, completed."""
 
     def over_runs(c: CaseResult, name: str, digits: int, statistic: Callable[[np.ndarray], object] = np.max) -> str:
         good = c.figures(name)[np.isfinite(c.figures(name))]

@@ -107,7 +107,7 @@ class CommandThread(threading.Thread):
     @property
     def cruising(self) -> bool:
         """The arm goes at full speed and will for a while."""
-        going = self.state.fault is Fault.NONE and self.state.sent > 25 and self.state.process_on == self.process
+        going = self.state.fault is Fault.NONE and self.state.number > 25 and self.state.process_on == self.process
         return going and self._stroke.cruising and float(np.abs(self.state.qd).max()) > 0.05
 
 

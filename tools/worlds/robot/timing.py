@@ -39,7 +39,7 @@ class Tap:
     motions: array[float] = field(default_factory=lambda: array("d"))
     state_now: LinkState | None = None
     starts: list[int] = field(default_factory=lambda: [0])  # how many commands had been sent when a link began
-    _heard: int = -1
+    _heard: float = -1.0
     _wanted: float = 0.0
     _stepped: tuple[float, float, float] | None = None  # when, from, to
 
@@ -64,10 +64,10 @@ class Tap:
         if not self.command_times:
             return found
         self.ages.append(found.age_s)
-        if found.heard != self._heard:
+        if found.echo != self._heard:
             if self._heard >= 0:  # a link's first state may know of no command yet
-                self.echoes.append(found.echo_latency_s)
-            self._heard = found.heard
+                self.echoes.append(found.echo_latency)
+            self._heard = found.echo
         if self._stepped is not None:
             when, before, after = self._stepped
             if (found.qd[STEP_JOINT] - before) / (after - before) > 0.5:

@@ -57,6 +57,20 @@ def producer_path(given: str) -> str:
     )
 
 
+@dataclass(kw_only=True)
+class GenicamKeys:
+    """The keys that every `!Genicam...` driver has."""
+
+    producer: str = ""  # the .cti file; empty: the only one that GENICAM_GENTL64_PATH leads to
+    device: str = ""  # serial number, model, name or id; empty: the only one
+    profile: str = "generic"  # of profiles.yaml: phoxi, motioncam, genicam_3d, ranger3, generic
+    settings: dict[str, str] = field(default_factory=dict)  # features by name, over those of the profile
+
+    def title(self, kind: str) -> str:
+        """The device's name at the beginning of a sentence."""
+        return f"The {kind} {self.device or self.profile} (GenICam)"
+
+
 @dataclass(frozen=True, eq=False)
 class Component:
     """A component of a frame: pixel format by its GenICam name, and values as the device sent them."""
@@ -69,8 +83,7 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class CopiedFrame:
-    """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has
-    none)."""
+    """A frame: components copied out of the buffer, its number, its stamp (s, device's clock; None: none)."""
 
     components: tuple[Component, ...]
     number: int | None

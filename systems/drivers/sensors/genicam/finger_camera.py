@@ -6,6 +6,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.device import (
     Component,
     GenicamDevice,
+    GenicamKeys,
     GenicamSource,
     get_profile,
     picture_of,
@@ -23,24 +24,13 @@ from weldcal.systems.drivers.station_build import StationBuild
 
 
 @dc.dataclass(kw_only=True)
-class GenicamFingerCamera(WiredFingerCamera):
-    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets
-    ExposureTime."""
-
-    producer: str = ""
-    device: str = ""
-    profile: str = "generic"
-    settings: dict[str, str] = dc.field(default_factory=dict)
-
-    @property
-    def title(self) -> str:
-        """The device's name at the beginning of a sentence."""
-        return f"The finger camera {self.device or self.profile} (GenICam)"
+class GenicamFingerCamera(GenicamKeys, WiredFingerCamera):
+    """`!GenicamFingerCamera`: the maker's GenTL producer, device and features; `exposure_ms` sets ExposureTime."""
 
     def source(self) -> Source[Picture]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamPictures(self)  # the keys are checked here, not in the process
-        return SourceProcess(self.title, GenicamPictures, self)
+        return SourceProcess(self.title("finger camera"), GenicamPictures, self)
 
 
 class GenicamPictures(GenicamSource[Picture]):
@@ -54,7 +44,9 @@ class GenicamPictures(GenicamSource[Picture]):
         if config.gain is not None:
             own["Gain"] = f"{config.gain:.6g}"
         features = profile.features(streams=True, own=own)
-        super().__init__(GenicamDevice(config.producer, config.device, features, profile.alive), config.title)
+        super().__init__(
+            GenicamDevice(config.producer, config.device, features, profile.alive), config.title("finger camera")
+        )
         self._config = config
 
     def datum(self, components: tuple[Component, ...]) -> Picture:

@@ -8,6 +8,7 @@ from weldcal.systems.drivers.sensors.genicam.device import (
     UNIT_SCALING,
     Component,
     GenicamDevice,
+    GenicamKeys,
     GenicamSource,
     get_profile,
     profile_of,
@@ -27,28 +28,20 @@ _METRES = {"m": 1.0, "mm": 1e-3}
 
 
 @dc.dataclass(kw_only=True)
-class GenicamProfiler(WiredProfiler):
+class GenicamProfiler(GenicamKeys, WiredProfiler):
     """`!GenicamProfiler`: the maker's GenTL producer, the device, and its features.
 
     The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's
     Scan3dCoordinateScale and Scan3dCoordinateOffset of its coordinates A and C.
     """
 
-    producer: str = ""
-    device: str = ""
     profile: str = "ranger3"
-    settings: dict[str, str] = dc.field(default_factory=dict)
     unit: str = "device"
-
-    @property
-    def title(self) -> str:
-        """The device's name at the beginning of a sentence."""
-        return f"The profiler {self.device or self.profile} (GenICam)"
 
     def source(self) -> Source[Profile]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamProfiles(self)  # the keys are checked here, not in the process
-        return SourceProcess(self.title, GenicamProfiles, self)
+        return SourceProcess(self.title("profiler"), GenicamProfiles, self)
 
 
 class GenicamProfiles(GenicamSource[Profile]):
@@ -58,7 +51,7 @@ class GenicamProfiles(GenicamSource[Profile]):
         profile = get_profile(config.profile)
         features = profile.features(streams=False, own=config.settings)
         device = GenicamDevice(config.producer, config.device, features, profile.alive)
-        super().__init__(device, config.title, profile.trigger)
+        super().__init__(device, config.title("profiler"), profile.trigger)
         self._config = config
         self._unit = profile.unit if config.unit == "device" else config.unit
         self._metres, self._scaling = 1e-3, UNIT_SCALING

@@ -6,6 +6,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.device import (
     Component,
     GenicamDevice,
+    GenicamKeys,
     GenicamSource,
     cloud_of,
     get_profile,
@@ -19,16 +20,12 @@ GENICAM_UNIT_M = 1e-3  # of a device that does not say its unit
 
 
 @dc.dataclass(kw_only=True)
-class GenicamScanner(WiredScanner):
+class GenicamScanner(GenicamKeys, WiredScanner):
     """`!GenicamScanner`: the maker's GenTL producer, the device, and its features.
 
     `unit: device` takes the unit of the profile, or of the device's Scan3dDistanceUnit.
     """
 
-    producer: str = ""  # the .cti file; empty: the only one that GENICAM_GENTL64_PATH leads to
-    device: str = ""  # serial number, model, name or id; empty: the only one
-    profile: str = "generic"  # of profiles.yaml: phoxi, motioncam, genicam_3d, generic
-    settings: dict[str, str] = dc.field(default_factory=dict)  # features by name, over those of the profile
     unit: str = "device"
 
     @property
@@ -39,15 +36,10 @@ class GenicamScanner(WiredScanner):
         unit = get_profile(self.profile).unit
         return {"m": 1.0, "mm": 1e-3}.get(unit, GENICAM_UNIT_M)
 
-    @property
-    def title(self) -> str:
-        """The device's name at the beginning of a sentence."""
-        return f"The scanner {self.device or self.profile} (GenICam)"
-
     def source(self) -> Source[Cloud]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamClouds(self)  # the keys are checked here, not in the process
-        return SourceProcess(self.title, GenicamClouds, self)
+        return SourceProcess(self.title("scanner"), GenicamClouds, self)
 
 
 class GenicamClouds(GenicamSource[Cloud]):
@@ -57,7 +49,7 @@ class GenicamClouds(GenicamSource[Cloud]):
         profile = get_profile(config.profile)
         features = profile.features(streams=config.streams, own=config.settings)
         device = GenicamDevice(config.producer, config.device, features, profile.alive)
-        super().__init__(device, config.title, "" if config.streams else profile.trigger)
+        super().__init__(device, config.title("scanner"), "" if config.streams else profile.trigger)
         self._asks_device = config.unit == "device" and profile.unit == "device"
         self._metres, self._far_m = config.metres, config.scanner().far_m
 

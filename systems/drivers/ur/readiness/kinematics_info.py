@@ -1,5 +1,4 @@
-"""Reads a robot's factory kinematics and joint limits from its primary port, and checks the kinematics against the
-flange pose."""
+"""Read a robot's factory kinematics and joint limits from its primary port, and check them by the flange pose."""
 
 import re
 import struct
@@ -149,8 +148,10 @@ def limited_arm(arm: ArmModel, limits: JointLimits | None) -> ArmModel:
 
 
 def model_finding(told: str, wanted: str) -> tuple[bool, str, str]:
-    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm; what was found; the operator
-    action."""
+    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm.
+
+    What was found; the operator action.
+    """
     if not (found := _ROBOT_MODEL.search(told)):
         return True, f"the dashboard says {told!r}; the kinematics tell", ""
     same = found[0].upper() in (CONTROLLER_MODELS[wanted][0], wanted.upper().rstrip("E"))

@@ -35,8 +35,10 @@ class ExpectedLoad:
 
 
 def mounting_finding(seen: Mapping[str, Value], up: Array) -> Finding:
-    """Compare the controller's gravity (3,) in the base, which points up in its convention, with the scenario's `up`
-    (3,)."""
+    """Compare the controller's gravity (3,) in the base with the scenario's `up` (3,).
+
+    The gravity points up in the controller's convention.
+    """
     wanted = _direction(up)
     if GRAVITY_OUTPUT not in seen or not np.linalg.norm(seen[GRAVITY_OUTPUT]) > 1.0:
         return True, f"not readable; Installation > General > Mounting must agree: up is {wanted} in the base", ""
@@ -65,8 +67,10 @@ def payload_finding(seen: Mapping[str, Value], expected: ExpectedLoad | None) ->
 
 
 def mode_finding(answer: str) -> Finding:
-    """What the dashboard's answer to `get operational mode` means; an answer that is no mode is shown and not
-    judged."""
+    """What the dashboard's answer to `get operational mode` means.
+
+    An answer that is no mode is shown and not judged.
+    """
     mode = answer.strip().upper()
     if mode == "MANUAL":
         return False, "Manual", actions.MANUAL

@@ -121,15 +121,17 @@ class Check:
     checked: bool = True
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class Preflight:
-    """All checks, and the values read for them (None where not read): arm_q (6,) rad, tcp_pose and tcp_offset (6,) as
-    x, y, z (m) and a rotation vector (rad), the controller's version, the robot's kinematics and the arm with it,
-    the distance of the computed flange pose from the controller's, and the register range for the driver.
+    """All checks, and the values read for them (None where not read).
+
+    arm_q (6,) rad, tcp_pose and tcp_offset (6,) as x, y, z (m) and a rotation vector (rad), the controller's version,
+    the robot's kinematics and the arm with it, the distance of the computed flange pose from the controller's, and the
+    register range for the driver.
     """
 
     host: str
-    checks: tuple[Check, ...]
+    checks: tuple[Check, ...] = ()
     arm_q: Array | None = None
     tcp_pose: Array | None = None
     tcp_offset: Array | None = None
@@ -196,34 +198,18 @@ class _Look:
 
     def __init__(self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None, doubles: int) -> None:
         self._load, self._doubles = load, doubles
-        self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
+        self._found, self._timeout_s, self._nominal = Preflight(host=host), timeout_s, nominal
         self._done: dict[str, Check] = {}
         self._seen: Mapping[str, Value] = {}
-        self._version: tuple[int, ...] | None = None
-        self._kinematics: KinematicsInfo | None = None
-        self._arm: ArmModel | None = None
-        self._error: tuple[float, float] | None = None
         self._whose_limits = "the controller reports none"
         self._dashboard = True
-        self._upper = True
 
     def report(self) -> Preflight:
         """All checks in their order, including those not made."""
-        checks = tuple(self._done.get(name) or self._waiting(name) for name in CHECKS)
-        error_m, error_rad = self._error or (None, None)
-        return Preflight(
-            host=self._host,
-            checks=checks,
-            arm_q=self._six("actual_q"),
-            tcp_pose=self._six("actual_TCP_pose"),
-            tcp_offset=self._six("tcp_offset"),
-            version=self._version,
-            kinematics=self._kinematics,
-            arm=self._arm,
-            pose_error_m=error_m,
-            pose_error_rad=error_rad,
-            upper_registers=self._upper,
-        )
+        found = self._found
+        found.checks = tuple(self._done.get(name) or self._waiting(name) for name in CHECKS)
+        found.arm_q, found.tcp_pose, found.tcp_offset = map(self._six, ("actual_q", "actual_TCP_pose", "tcp_offset"))
+        return found
 
     def _waiting(self, name: str) -> Check:
         """A check that could not be made, with the check that must pass first."""
@@ -233,7 +219,7 @@ class _Look:
 
     def run(self, upper: bool | None) -> None:
         """Make all checks that can be made."""
-        self._upper = upper is not False
+        self._found.upper_registers = upper is not False
         try:
             claims = self._ask_rtde()
         except RobotUnreachable as problem:
@@ -261,12 +247,12 @@ class _Look:
 
     @property
     def _offset(self) -> int:
-        return UPPER_OFFSET if self._upper else 0
+        return UPPER_OFFSET if self._found.upper_registers else 0
 
     def _ask_rtde(self) -> dict[str, str]:
         """Read the values for all checks, and the result of claiming the driver's registers; releases them at once."""
-        with RtdeProbe(self._host, self._timeout_s) as rtde:
-            self._version = rtde.version
+        with RtdeProbe(self._found.host, self._timeout_s) as rtde:
+            self._found.version = rtde.version
             if not self._check_version(rtde.version):
                 return {}
             claims = rtde.claim(register_names(self._offset, self._doubles))
@@ -292,10 +278,10 @@ class _Look:
 
     @property
     def _version_text(self) -> str:
-        return "PolyScope " + ".".join(str(number) for number in (self._version or ())[:3])
+        return "PolyScope " + ".".join(str(number) for number in (self._found.version or ())[:3])
 
     def _is_x(self) -> bool:
-        return self._version is not None and self._version[0] >= POLYSCOPE_X
+        return self._found.version is not None and self._found.version[0] >= POLYSCOPE_X
 
     def _check_version(self, version: tuple[int, ...]) -> bool:
         good = is_supported(version)
@@ -338,7 +324,7 @@ class _Look:
         self._state("standstill", speed <= REST_RAD_S, found, actions.STANDSTILL)
 
     def _check_limits(self) -> None:
-        q, arm = self._vector("actual_q"), self._arm or self._nominal
+        q, arm = self._vector("actual_q"), self._found.arm or self._nominal
         margin = np.minimum(q - arm.position_lower, arm.position_upper - q)
         worst = int(np.argmin(margin))
         joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
@@ -387,21 +373,23 @@ class _Look:
 
     def _check_kinematics(self) -> None:
         try:
-            self._kinematics, limits = read_kinematics(self._host, self._timeout_s)
+            info, limits = read_kinematics(self._found.host, self._timeout_s)
         except RobotRefused as problem:
             self._bad("kinematics", "not readable on port 30001", str(problem))
             return
+        self._found.kinematics = info
         try:
-            self._arm = limited_arm(calibrated_arm(self._nominal, self._kinematics), limits)
+            arm = self._found.arm = limited_arm(calibrated_arm(self._nominal, info), limits)
         except InputError as problem:
             self._bad("kinematics", f"not a {self._nominal.name}'s", str(problem))
             return
         if limits is not None:
             self._whose_limits = "the pendant's may be nearer"  # its safety limits: what is reported may not hold them
-        found = "factory calibration" if self._kinematics.calibrated else "nominal, as URSim or an emulator has it"
+        found = "factory calibration" if info.calibrated else "nominal, as URSim or an emulator has it"
         self._ok("kinematics", found)
         pose, offset = self._vector("actual_TCP_pose"), self._vector("tcp_offset")
-        error_m, error_rad = self._error = cross_check(self._arm, self._vector("actual_q"), pose, offset)
+        error_m, error_rad = cross_check(arm, self._vector("actual_q"), pose, offset)
+        self._found.pose_error_m, self._found.pose_error_rad = error_m, error_rad
         agrees = error_m <= KINEMATICS_TOLERANCE_M and error_rad <= KINEMATICS_TOLERANCE_RAD
         found = f"{1e3 * error_m:.3f} mm, {np.rad2deg(error_rad):.4f} deg from the controller's"
         self._state("flange pose", agrees, found, actions.POSE)
@@ -429,7 +417,7 @@ class _Look:
 
     def _ask(self, command: str) -> str:
         """The dashboard's answer; LOCAL where it refuses because the robot is in local control."""
-        answer = ask(self._host, command, self._timeout_s)
+        answer = ask(self._found.host, command, self._timeout_s)
         return LOCAL if "remote control mode" in answer.lower() else answer
 
     def _vector(self, name: str) -> Array:

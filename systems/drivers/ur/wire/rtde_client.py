@@ -5,11 +5,12 @@ Packages of protocol version 2 are big endian: uint16 size (header included), ui
 
 from __future__ import annotations
 
-import math
 import socket
 import struct
 from collections.abc import Sequence
 from types import TracebackType
+
+import numpy as np
 
 from weldcal.systems.drivers.ur.faults import Fault, RobotUnreachable, reported_as, sentence
 from weldcal.systems.drivers.ur.wire.line import SocketLine
@@ -88,12 +89,12 @@ class RtdeProbe:
         Raises:
             NotFinite: a value is not a finite number.
         """
-        types = self._set_outputs(names)
+        types = self.subscribe(names)
         wanted = [name for name, kind in zip(names, types, strict=True) if kind != NOT_FOUND]
         if not wanted:
             return {}
         if len(wanted) < len(names):
-            types = self._set_outputs(wanted)
+            types = self.subscribe(wanted)
         if not set(types) <= set(CODES):
             raise self._line.nonsense()
         (started,) = self._unpack(">?", self._request(_START, b""))
@@ -101,18 +102,14 @@ class RtdeProbe:
             raise self._line.nonsense()
         payload = self._next(_DATA)
         self._request(_PAUSE, b"")
-        layout = struct.Struct(">B" + "".join(CODES[kind] for kind in types))
+        layout, places = package_layout(wanted, types)
         if len(payload) != layout.size:
             raise self._line.nonsense()
-        numbers = layout.unpack(payload)[1:]
-        values: dict[str, Value] = {}
-        at = 0
-        for name, kind in zip(wanted, types, strict=True):
-            width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
-            values[name] = numbers[at : at + width] if width else numbers[at]
-            if not all(map(math.isfinite, numbers[at : at + (width or 1)])):
+        numbers = layout.unpack(payload)
+        values: dict[str, Value] = {name: numbers[place] for name, place in places.items()}
+        for name, value in values.items():
+            if not np.isfinite(value).all():
                 raise NotFinite(name)
-            at += width or 1
         return values
 
     def claim(self, names: Sequence[str]) -> dict[str, str]:
@@ -131,10 +128,6 @@ class RtdeProbe:
         payload = self._request(_INPUTS, ",".join(names).encode())
         return payload[0], self._types(payload, len(names))
 
-    def subscribe(self, names: Sequence[str], frequency_hz: float) -> list[str]:
-        """Choose the outputs of the stream; returns the type of each, or NOT_FOUND."""
-        return self._set_outputs(names, frequency_hz)
-
     def start(self) -> tuple[socket.socket, bytearray]:
         """Start the stream; returns the connection, which stays this client's, and what has arrived of it."""
         (started,) = self._unpack(">?", self._request(_START, b""))
@@ -143,13 +136,15 @@ class RtdeProbe:
         return self._line.release()
 
     def grant(self, names: Sequence[str]) -> int | None:
-        """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not
-        free."""
+        """Claim these inputs for `write`, and start.
+
+        Returns the recipe's number, or None where one of them is not free.
+        """
         payload = self._request(_INPUTS, ",".join(names).encode())
         if {IN_USE, NOT_FOUND} & set(self._types(payload, len(names))):
             return None
         # a controller starts only a client with outputs; one package a second costs almost nothing
-        self._set_outputs(("timestamp",), SLOWEST_HZ)
+        self.subscribe(("timestamp",), SLOWEST_HZ)
         self._request(_START, b"")
         return payload[0]
 
@@ -158,7 +153,8 @@ class RtdeProbe:
         self._line.drain()
         self._line.send(struct.pack(">HB", len(package) + 3, _DATA) + package)
 
-    def _set_outputs(self, names: Sequence[str], frequency_hz: float = FREQUENCY_HZ) -> list[str]:
+    def subscribe(self, names: Sequence[str], frequency_hz: float = FREQUENCY_HZ) -> list[str]:
+        """Choose the outputs of the stream; returns the type of each, or NOT_FOUND."""
         request = struct.pack(">d", frequency_hz) + ",".join(names).encode()
         return self._types(self._request(_OUTPUTS, request), len(names))
 
@@ -187,6 +183,17 @@ class RtdeProbe:
         if len(payload) != struct.calcsize(code):
             raise self._line.nonsense()
         return struct.unpack(code, payload)
+
+
+def package_layout(names: Sequence[str], kinds: Sequence[str]) -> tuple[struct.Struct, dict[str, slice | int]]:
+    """The layout of an output package, its recipe's number first, and each output's place among its numbers."""
+    places: dict[str, slice | int] = {}
+    at = 1
+    for name, kind in zip(names, kinds, strict=True):
+        width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
+        places[name] = slice(at, at + width) if width else at
+        at += width or 1
+    return struct.Struct(">B" + "".join(CODES[kind] for kind in kinds)), places
 
 
 def _groups(names: Sequence[str]) -> list[list[str]]:

@@ -1,5 +1,6 @@
-"""The stream of packages between the worker and the controller: the newest outputs are read, the command registers
-written.
+"""The stream of packages between the worker and the controller.
+
+The newest outputs are read, the command registers written.
 
 One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_client`.
 """
@@ -14,7 +15,7 @@ import time
 from collections.abc import Sequence
 
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, NotFinite, RtdeProbe
+from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, NotFinite, RtdeProbe, package_layout
 
 E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0
 DATA = ord("U")
@@ -22,8 +23,9 @@ HEADER = struct.Struct(">HB")
 
 
 class RtdeStream:
-    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed; without `inputs`
-    it only reads.
+    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed.
+
+    Without `inputs` it only reads.
 
     Raises:
         RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is
@@ -46,13 +48,7 @@ class RtdeStream:
             self._probe.close()
             raise
         self._socket, self._inbox = self._probe.start()
-        self._layout = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
-        self._at: dict[str, slice | int] = {}
-        at = 1
-        for name, kind in zip(outputs, kinds, strict=True):
-            width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
-            self._at[name] = slice(at, at + width) if width else at
-            at += width or 1
+        self._layout, self._at = package_layout(outputs, kinds)
         self._newest: tuple[float, ...] | None = None
         self._read = 0
         self.connected = True

@@ -53,8 +53,7 @@ class Nominal:
 
 @dataclass
 class Task:
-    """What force_mode was asked for: frame as a matrix in the base, 1 where compliant, [f; t] to press with, type,
-    limits."""
+    """What force_mode was asked for: frame in the base, 1 where compliant, wrench [f; t], type, limits."""
 
     frame: Array
     selection: Array
@@ -113,8 +112,10 @@ def free_task(frame: list[float], free_axes: Array) -> Task:
 
 
 def _axes(task: Task, p: Array, v: Array) -> Array:
-    """Axes (3, 3) of the task frame in the base: type 1 turns y towards the frame's origin, type 3 x along the
-    motion."""
+    """Axes (3, 3) of the task frame in the base.
+
+    Type 1 turns y towards the frame's origin, type 3 x along the motion.
+    """
     R = task.frame[:3, :3]
     if task.kind == 1:
         y = task.frame[:3, 3] - p

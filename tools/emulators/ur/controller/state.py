@@ -161,8 +161,7 @@ class ControllerState:
         self.arm.set_tcp(self.tcp_offset)
 
     def touch(self) -> Array:
-        """The wrench on the tool centre point in base axes, as the surroundings make it, or a client's sensor says
-        it."""
+        """The wrench on the tool centre point in base axes, from the surroundings or from a client's sensor."""
         if self.sensor.external:
             X = self.arm.flange(self.arm.q)[:3, :3]
             return np.concatenate([X @ self.sensor.written[:3], X @ self.sensor.written[3:]])

@@ -214,8 +214,10 @@ class _Emitter:
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
     def _truth(self, expression: Expression) -> str:
-        """The expression as a condition; what can only be True or False is not asked what it is, a hundred times a
-        frame."""
+        """The expression as a condition.
+
+        What can only be True or False is not asked what it is, a hundred times a frame.
+        """
         value = self.value(expression)
         boolean = isinstance(expression, syntax.Operation) and expression.operator in _BOOLEAN
         return value if boolean else f"truth({value})"

@@ -216,8 +216,10 @@ class ExternalControl(Server):
 
 
 def kinematics_info(model: ArmModel) -> bytes:
-    """The body of KinematicsInfo: six checksums, theta, a, d, alpha of the chain in use, and whether it is
-    calibrated."""
+    """The body of KinematicsInfo.
+
+    Six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated.
+    """
     dh = dh_parameters(model)
     numbers = [*dh.theta, *dh.a, *dh.d, *dh.alpha]
     packed = struct.pack(">24d", *numbers)

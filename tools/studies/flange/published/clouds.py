@@ -18,6 +18,7 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     Algorithm1State,
+    Method,
     Verification,
     algorithm1_start,
     algorithm1_step,
@@ -26,7 +27,6 @@ from weldcal.calibration.published.algorithm1 import (
     sight,
 )
 from weldcal.calibration.published.pipeline import (
-    Method,
     PublishedVerification,
     all_pairs,
     at_flange,
@@ -57,8 +57,11 @@ RUNS_OF_ALGORITHM1 = ("algorithm1", "plane", "edges")
 
 @dataclass(frozen=True, eq=False)
 class CircleRow:
-    """The circle of one cloud: 3-D rms (m) of the published centre over seeds, its offset (3,) m in R from the edges'
-    centre, and how far apart the centres from the two random halves of the cloud are, both methods (m)."""
+    """The circle of one cloud: 3-D rms (m) of the published centre over seeds, and its offset (3,) m in R.
+
+    The offset is from the edges' centre; also how far apart the centres from two random halves of the cloud are,
+    both methods (m).
+    """
 
     id: str
     repeat_m: float
@@ -69,8 +72,11 @@ class CircleRow:
 
 @dataclass(frozen=True, eq=False)
 class SightRow:
-    """A kind of registration against a good calibration: ``value`` (6,) it reports (rad, m, at the flange centre),
-    ``share`` (6,) of a known error it shows, the components it names blind."""
+    """A kind of registration against a good calibration.
+
+    ``value`` (6,) it reports (rad, m, at the flange centre), ``share`` (6,) of a known error it shows, the
+    components it names blind.
+    """
 
     title: str
     value: Array
@@ -80,8 +86,7 @@ class SightRow:
 
 @dataclass(frozen=True, eq=False)
 class SplitRow:
-    """One way to calibrate, over all splits: errors (m) on held-out scans, and what it reports itself, by split (NaN:
-    no figure of its own)."""
+    """One method over all splits: errors (m) on held-out scans, and what it reports by split (NaN: nothing)."""
 
     name: str
     held_out: Array
@@ -128,8 +133,7 @@ class CloudsOutcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Material:
-    """What both methods see of one folder: our observations and the published circles of the same scans, and the
-    CAD."""
+    """What both methods see of a folder: our observations, published circles of the same scans, and the CAD."""
 
     data: Dataset
     standard: FlangeStandard
@@ -167,9 +171,11 @@ def study_clouds(
     progress: Progress,
     circles: int | None = None,
 ) -> CloudsOutcome:
-    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on
-    held-out scans, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than
-    ten show a flange to both methods."""
+    """Study one folder of segmented scans.
+
+    ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on held-out scans, repeated circles of the first
+    ``circles`` scans (all where None). Raises InputError when fewer than ten show a flange to both methods.
+    """
     progress("circles and edges", 0.0)
     material = read_material(data, standard, seed)
     ids = [o.id for o in material.circles]
@@ -330,8 +336,7 @@ def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
 
 
 def _path(material: Material, held: str, rng: np.random.Generator) -> tuple[Array, Array]:
-    """One shuffled run: e_icp (steps, 6) at the camera and the true median error (steps,) m after each scan from the
-    fourth on."""
+    """Run once shuffled: e_icp (steps, 6) at the camera and true median error (steps,) m, from scan four on."""
     pairs = [o for o in material.circles if o.id != held]
     state = algorithm1_start(1e-12, 1000)
     verifier = material.verifier(held, "algorithm1")

@@ -22,6 +22,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.report.render import statistics
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
 from weldcal.tools.studies.flange.published.pairs import (
     KinectOutcome,
@@ -32,7 +33,7 @@ from weldcal.tools.studies.flange.published.pairs import (
 )
 from weldcal.tools.studies.flange.published.report import COST_HEADER, PublishedResults, cost_rows, pictures, tables
 from weldcal.tools.studies.flange.published.simulation import simulate
-from weldcal.tools.studies.harness import Study, statistics
+from weldcal.tools.studies.harness import Study
 from weldcal.tools.worlds.flange_frames import P_FS, SphereScan, cell_scans
 
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}
@@ -42,8 +43,7 @@ FALSE, OF = 3, 54
 
 
 def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
-    """X_BC from centres of a sphere (n >= 4) whose place on the flange is estimated, too; least squares, as commercial
-    software does it.
+    """Estimate X_BC from sphere centres (n >= 4), with the sphere's place on the flange, by least squares.
 
     Gauss-Newton on X_BC c_k - X_BF,k p_FS, from the place as it was meant.
     """
@@ -65,8 +65,7 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
 ) -> tuple[list[dict[str, object]], dict[str, object]]:
-    """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's
-    false segmentations.
+    """Compare sphere and flange in the same scans with 4 and 16 pairs; also Table 1's false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
     """

@@ -24,8 +24,11 @@ PAPER_E_XYZ_MM = (-11.11, 3.90, 7.15)
 
 @dataclass(frozen=True, eq=False)
 class StoredRuns:
-    """50 shuffled runs as the authors stored them: (runs, steps) reported error m, (runs, steps, 6) roll, pitch, yaw
-    (rad) and x, y, z (m), and the final H of each run."""
+    """50 shuffled runs as the authors stored them.
+
+    (runs, steps) reported error m, (runs, steps, 6) roll, pitch, yaw (rad) and x, y, z (m), and the final H of each
+    run.
+    """
 
     reported: Array
     components: Array
@@ -33,8 +36,7 @@ class StoredRuns:
 
     @property
     def X_BC_implied(self) -> RigidTransform:
-        """The calibration at which e_icp would be zero, mean over the runs of H e: what their verification cloud
-        says."""
+        """The calibration of zero e_icp, mean over the runs of H e: what their verification cloud says."""
         ends = [
             X @ RigidTransform(RollPitchYaw(*e[:3]), e[3:])
             for X, e in zip(self.X_BC, self.components[:, -1], strict=True)
@@ -161,9 +163,12 @@ def _svd_folds(pairs: list[Observation], good: list[Observation], repeats: int, 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KinectOutcome:
-    """Errors (m) at the wrist ring: ``residual`` of the all-pairs SVD, ``held_out`` of it and ``ours`` of the robust
-    fit in 5 folds, ``compensated`` of H e with the paper's own e (Eq. (21)); ``shift_m`` how far that e moves the
-    middle of the workspace, and ``at_camera_m`` its translation, taken at the camera."""
+    """Errors (m) at the wrist ring.
+
+    ``residual`` of the all-pairs SVD, ``held_out`` of it and ``ours`` of the robust fit in 5 folds, ``compensated``
+    of H e with the paper's own e (Eq. (21)); ``shift_m`` how far that e moves the middle of the workspace, and
+    ``at_camera_m`` its translation, taken at the camera.
+    """
 
     name: str
     n: int
@@ -181,8 +186,7 @@ def paper_error() -> RigidTransform:
 
 
 def study_kinect(name: str, pairs: list[Observation], *, repeats: int, seed: int) -> KinectOutcome:
-    """All of section 4.2 that centre pairs allow: its verification cloud is not among them, so e itself is the
-    paper's."""
+    """Repeat what centre pairs allow of section 4.2; e is the paper's, as its verification cloud is not there."""
     X, e = all_pairs(pairs), paper_error()
     ours = k_fold(pairs, folds=5, repeats=repeats, seed=seed)
     middle = np.mean([o.p_CR for o in pairs], axis=0)

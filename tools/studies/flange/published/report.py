@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, subplots, svg
-from weldcal.tools.report.render import fixed
+from weldcal.tools.report.render import fixed, statistics
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import COSTS, Errors, Simulation
-from weldcal.tools.studies.harness import Results, Row, Table, statistics
+from weldcal.tools.studies.harness import Results, Row, Table
 
 TABLE1: dict[str, tuple[float, ...]] = {
     "UR5 & PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),
@@ -140,8 +140,7 @@ def fig9(s: Simulation) -> bytes:
 
 
 def fig10(s: Simulation) -> bytes:
-    """Errors at the camera against the scans used, 1 mm of noise, and the error that the paper does not plot: at the
-    flanges."""
+    """Draw errors at the camera against the scans used (1 mm of noise), and at the flanges, not in the paper."""
     steps = np.arange(4, 4 + len(s.history))
     picture, true = _steps(steps, s.history.transpose(1, 0, 2), ("translation at the camera, mm", "rotation, degrees"))
     high = 1e3 * s.history_tcp
@@ -222,8 +221,7 @@ def costs(s: Simulation) -> bytes:
 
 
 def circles(c: CloudsOutcome) -> bytes:
-    """Where the published circle puts the centre, in the flange's own plane: seed to seed, scan by scan; ours is the
-    origin."""
+    """Draw where the published circle puts the centre in the flange's plane, by seed and scan; ours is the origin."""
     picture, (axes, halves) = subplots(7.6, 3.2, 1, 2, width_ratios=(1.0, 1.2))
     k = np.arange(len(c.circles))
     halves.bar(k - 0.2, [1e3 * r.halves_published_m for r in c.circles], 0.4, color=THEIRS, label="published circle")

@@ -39,8 +39,11 @@ COSTS = {
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of K calibrations: ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper
-    takes them; ``at_tcp`` (K, 75) m, how far each flange centre is put from where it is."""
+    """Errors of K calibrations.
+
+    ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes them; ``at_tcp`` (K,
+    75) m, how far each flange centre is put from where it is.
+    """
 
     e: Array
     at_tcp: Array
@@ -48,10 +51,12 @@ class Errors:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Simulation:
-    """``levels_m`` (L,) noise; standard deviations (L, 6) and means (L, 6) of all pairs and of Algorithm 1 judged by
-    the truth (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10) with ``history_tcp`` (75 - 3, K) m, the mean
-    true error; ``costs`` at 1 mm, by name of COSTS; ``best_of_three`` the best, by the truth, of three shuffled runs at
-    1 mm."""
+    """Standard deviations and means (L, 6) at ``levels_m`` (L,) noise.
+
+    Of all pairs and of Algorithm 1 judged by the truth (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10)
+    with ``history_tcp`` (75 - 3, K) m, the mean true error; ``costs`` at 1 mm, by name of COSTS; ``best_of_three``
+    the best, by the truth, of three shuffled runs at 1 mm.
+    """
 
     levels_m: Array
     all_mean: Array
@@ -70,8 +75,7 @@ class Simulation:
 
     @property
     def ratio(self) -> Array:
-        """All pairs over Algorithm 1 (6,), standard deviations, averaged over the levels: the paper says 7 for x and
-        y."""
+        """Standard deviations of all pairs over Algorithm 1 (6,), mean over the levels: 7 for x and y in the paper."""
         return np.asarray((self.all_std / self.truth_std).mean(axis=0))
 
 
@@ -212,8 +216,7 @@ def _all_pairs(p_B: Array, p_C: Array) -> tuple[Array, Array]:
 
 
 def _measured_camera(K: int, sigma: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The camera's pose as one verification flange gives it: R (K, 3, 3), t (K, 3); the flange under the middle of the
-    grid."""
+    """Measure the camera's pose R (K, 3, 3), t (K, 3) by one verification flange under the grid's middle."""
     p_B = np.array(WORKSPACE_CENTRE_M)
     p_C = X_BC_TRUE.inverse() @ p_B + sigma * rng.standard_normal((K, 3))
     turn = Rotation.from_rotvec(1e3 * sigma * TILT_PER_MM * rng.standard_normal((K, 3))).as_matrix()
