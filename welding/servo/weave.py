@@ -164,7 +164,7 @@ def tool_bounds(
 
 def largest_frequency_hz(config: WeaveConfig, bounds: Iterable[Bound]) -> float:
     """The largest frequency at this amplitude that every bound allows, rounded down to 0.01 Hz."""
-    ratios = [(b.allowed / b.needed) ** (1.0 / b.power) for b in bounds if b.needed > 0.0]
+    ratios = [math.pow(b.allowed / b.needed, 1.0 / b.power) for b in bounds if b.needed > 0.0]
     most = min([config.frequency_hz * ratio for ratio in ratios] + [LARGEST_HZ])
     return math.floor(100.0 * most + 1e-9) / 100.0
 
