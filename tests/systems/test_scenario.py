@@ -228,6 +228,7 @@ welding:
   clearance_mm: 30.0
   seam_length_mm: 100.0
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
+  weave: {shape: crescent, amplitude_mm: 1.5, frequency_hz: 1.5, dwell_s: [0.1, 0.2], bow_mm: 0.5, plane_deg: 10.0}
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4
