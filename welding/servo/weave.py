@@ -180,9 +180,8 @@ def check_weave(config: WeaveConfig, bounds: Iterable[Bound]) -> None:
     if all(b.needed <= b.allowed * (1.0 + 1e-6) for b in bounds):
         return
     raise WeaveError(
-        f"A {config.shape} weave of {1e3 * config.amplitude_m:g} mm to each side at {config.frequency_hz:g} Hz is more"
-        f" than tool and arm can do: set its frequency_hz to {largest_frequency_hz(config, bounds):g} at most, or lower"
-        " its amplitude_mm."
+        f"A {config.shape} weave of {1e3 * config.amplitude_m:g} mm at {config.frequency_hz:g} Hz is more than tool and"
+        f" arm can do: set frequency_hz to {largest_frequency_hz(config, bounds):g} at most, or lower amplitude_mm."
     )
 
 

@@ -126,7 +126,7 @@ def test_a_weave_that_cannot_be_swung_is_refused(bad: dict[str, float]) -> None:
 def test_the_frequency_that_a_refusal_names_is_accepted(shape: str, plane_rad: float) -> None:
     tool = ToolGeometry(torch_offset_m=0.04)
     weave = WeaveConfig(shape=shape, amplitude_m=4.0 * MM, frequency_hz=3.0, plane_rad=plane_rad)
-    with pytest.raises(WeaveError, match=r"4 mm to each side at 3 Hz .* frequency_hz to [\d.]+ at most") as refusal:
+    with pytest.raises(WeaveError, match=r"4 mm at 3 Hz .* frequency_hz to [\d.]+ at most") as refusal:
         ServoConfig(weave=weave, tool=tool)
     (named,) = re.findall(r"frequency_hz to ([\d.]+) at", str(refusal.value))
     weave = ServoConfig(weave=replace(weave, frequency_hz=float(named)), tool=tool).weave
