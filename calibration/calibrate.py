@@ -130,7 +130,7 @@ def calibrate(
 
 
 def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Calibration:
-    """A calibration without a refinement, refined as ``steps`` say.
+    """Return a calibration without a refinement, refined as ``steps`` say.
 
     ``observations`` (n) are those it was made from, as measured.
 
@@ -186,10 +186,10 @@ def _refuse_change(change: ChangePoint | None, tcp: TcpOffset | None, observatio
         parts.append({"poses": option, "n": len(part), **_part(part)})
         offers.append(f"--poses {option} ({len(part)} scans)")
     raise ScannerMoved(
-        f"The scanner or the robot's base moved between '{change.before}' and '{change.after}': the poses before and"
-        f" after it agree on two camera positions, which differ by {1e3 * change.shift_m:.2f} mm at the flange and"
-        f" {np.degrees(change.rotation_rad):.3f} degrees. Calibrate one part: {' or '.join(offers)}; only the later one"
-        " holds where the scanner has stayed since.",
+        f"The scanner or the robot's base moved between '{change.before}' and '{change.after}'. The scans before and"
+        f" after give two scanner poses, which differ by {1e3 * change.shift_m:.2f} mm at the flange and"
+        f" {np.degrees(change.rotation_rad):.3f} degrees. Calibrate one part: {' or '.join(offers)}. Only the later part"
+        " is valid for the scanner where it is now.",
         {
             "change_point": {
                 "before": change.before,

@@ -14,7 +14,7 @@ class CollinearLandmarks(InputError):
 
 
 class EqualRotations(InputError):
-    """The hand never turned between touches, so that the pen's offset cannot be told from the camera's place."""
+    """Report that the hand never turned between touches, so that pen offset and camera position are not separable."""
 
 
 class TabletDataError(InputError):
@@ -50,7 +50,7 @@ class InconsistentData(WeldcalError):
 
 
 class RadiusError(InputError):
-    """The sphere's radius does not agree with what was seen of it."""
+    """Report that the sphere's radius does not agree with its profiles."""
 
 
 class FlangeNotFound(WeldcalError):

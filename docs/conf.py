@@ -11,8 +11,12 @@ project_copyright = author
 language = "en"
 
 # command_reference writes the reference of all commands from the program itself.
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "command_reference"]
-source_suffix = {".md": "markdown"}
+# myst_nb reads the tutorials, which are notebooks, and leaves the other pages to myst_parser. It executes none: a test
+# does, and their pictures are files. `-D nb_execution_mode=force` executes them and shows what they print.
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "command_reference"]
+source_suffix = {".md": "myst-nb"}
+nb_execution_mode = "off"
+nb_execution_timeout = 300
 exclude_patterns = ["_extensions"]
 
 # "--option" stays as it is typed, and `names` of docstrings are code.

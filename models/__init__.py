@@ -9,7 +9,7 @@ from typing import Any
 
 @cache
 def _homes(package: str) -> dict[str, tuple[str, str]]:
-    """The module, and the name in it, of each name that the package's file imports."""
+    """Return the module, and the name in it, of each name that the package's file imports."""
     import ast
 
     loader: Any = sys.modules[package].__loader__

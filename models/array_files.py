@@ -23,7 +23,7 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's markers th
 
 
 def read_grey_image(path: Path) -> NDArray[np.uint8]:
-    """The image (height, width) of a file in any format that OpenCV knows.
+    """Return the image (height, width) of a file in any format that OpenCV knows.
 
     Raises:
         InputError: no regular file, no image, or more pixels than the bound in limits.
@@ -32,7 +32,7 @@ def read_grey_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_raw_image(path: Path) -> NDArray[Any]:
-    """The pixels (height, width) or (height, width, channels) of a file as they are stored.
+    """Return the pixels (height, width) or (height, width, channels) of a file as they are stored.
 
     Raises InputError as read_grey_image.
     """
@@ -78,7 +78,7 @@ def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
 
 
 def _whole_png(content: bytes) -> bool:
-    """Whether no part of a PNG is longer than what follows: OpenCV makes space for it before it reads."""
+    """Return whether no part of a PNG is longer than what follows: OpenCV makes space for it before it reads."""
     at = len(_PNG)
     while at + 8 <= len(content):
         at += 12 + struct.unpack_from(">I", content, at)[0]
@@ -106,7 +106,7 @@ def _size(content: bytes) -> tuple[int, int]:
 
 
 def _tiff_size(content: bytes) -> tuple[int, int]:
-    """The largest width and height among the entries of a TIFF's first directory."""
+    """Return the largest width and height among the entries of a TIFF's first directory."""
     order = _TIFF[content[:4]]
     sides = {256: 0, 257: 0}
     at = struct.unpack_from(f"{order}I", content, 4)[0] if len(content) >= 8 else len(content)
@@ -169,7 +169,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, AnyA
 
 
 def read_npy(path: Path) -> AnyArray:
-    """The array of an npy file, as stored. Raises InputError as read_npz."""
+    """Return the array of an npy file, as stored. Raises InputError as read_npz."""
     with _undamaged(path, "NPY"), opened(path) as stream:
         size = stream.seek(0, 2)
         stream.seek(0)
@@ -179,7 +179,7 @@ def read_npy(path: Path) -> AnyArray:
 
 
 def npy_shape(path: Path) -> tuple[int, ...]:
-    """The shape that the header of an npy file states. Raises InputError as read_npz."""
+    """Return the shape that the header of an npy file states. Raises InputError as read_npz."""
     with _undamaged(path, "NPY"), opened(path) as stream:
         size = stream.seek(0, 2)
         stream.seek(0)
@@ -201,7 +201,7 @@ def _undamaged(path: Path, kind: str) -> Iterator[None]:
 
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The arrays that the central directory lists, by name."""
+    """Return the arrays that the central directory lists, by name."""
     listed = [m for m in archive.infolist() if m.filename.endswith(".npy")]
     if len(archive.infolist()) > MOST_ARRAYS:
         raise InputError(f"The file {path.name} holds more than {MOST_ARRAYS} arrays.")
@@ -211,7 +211,7 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]
     for member in listed:
         if member.compress_type not in _METHODS or member.flag_bits & 1:
             raise InputError(
-                f"The file {path.name} is encrypted or compressed in a way NumPy does not use; save it again."
+                f"The file {path.name} is encrypted, or its compression is not one of NumPy's. Save it again with NumPy."
             )
     return {m.filename.removesuffix(".npy"): m for m in listed}
 

@@ -146,7 +146,7 @@ def incidence_cosine(depth: Depth, fx: float, fy: float, cx: float, cy: float) -
 
 
 def _distortion(perfect: Depth, noise: DepthNoise, fx: float, fy: float, cx: float, cy: float, growth: Depth) -> Depth:
-    """The device's own errors (H,W) of a depth map, m."""
+    """Return the device's own errors (H,W) of a depth map, m."""
     gx, gy = noise.gradient_per_m
     height, width = perfect.shape
     u = (np.arange(width, dtype=np.float32) - np.float32(cx))[None, :] * np.float32(gx / fx)
@@ -181,7 +181,7 @@ def measured_points(
 
 
 def device_warp(shape: tuple[int, ...], amplitude_m: float, device: int) -> Depth:
-    """A smooth error (H,W) in metres with |error| <= amplitude, the same at every resolution for one device.
+    """Return a smooth error (H,W) in metres with |error| <= amplitude, the same at every resolution for one device.
 
     The lowest cosines of the image plane (constant, the tilts and four more) with seeded weights: the kind of space
     deformation that is left after a scanner's factory calibration.

@@ -21,7 +21,7 @@ _SHORT = 3000  # characters, which the reader in Python reads in a moment
 
 
 def read_document(path: Path) -> Any:
-    """The contents of a YAML file, or of a JSON file where its name ends so.
+    """Return the contents of a YAML file, or of a JSON file where its name ends so.
 
     Raises:
         InputError: no regular file, no UTF-8, not YAML or JSON, a key twice, or larger than the bounds in limits.
@@ -32,7 +32,7 @@ def read_document(path: Path) -> Any:
 
 
 def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
-    """The contents of a text of YAML or JSON, ``name`` of which appears in messages.
+    """Return the contents of a text of YAML or JSON, ``name`` of which appears in messages.
 
     Raises InputError as read_document.
     """
@@ -87,7 +87,7 @@ _Loader.add_multi_constructor("", _tagged)
 
 
 class _Twice(Exception):
-    """A key that stands twice in a mapping."""
+    """Name a key that is twice in a mapping."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ class DocumentSection:
 
     @staticmethod
     def of(file: str, value: Any, place: str = "") -> "DocumentSection":
-        """The mapping as a section. Raises InputError where it is none."""
+        """Return the mapping as a section. Raises InputError where it is none."""
         if not isinstance(value, Mapping):
             raise InputError(
                 f"'{file}': {place or 'the file'} must be a mapping of keys to values, not {shown(value)}."
@@ -166,26 +166,26 @@ class DocumentSection:
         return DocumentSection(file, value, place)
 
     def has(self, key: str) -> bool:
-        """Whether the key stands there with a value."""
+        """Return whether the key is there with a value."""
         return self.values.get(key) is not None
 
     def section(self, key: str) -> "DocumentSection":
-        """The mapping under a key; empty where there is none."""
+        """Return the mapping under a key; empty where there is none."""
         return DocumentSection.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
 
     def sections(self, key: str) -> tuple["DocumentSection", ...]:
-        """The mappings of the list under a key; none where there is none."""
+        """Return the mappings of the list under a key; none where there is none."""
         return tuple(DocumentSection.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
 
     def items(self, key: str) -> list[Any]:
-        """The list under a key; empty where there is none."""
+        """Return the list under a key; empty where there is none."""
         value = self.values[key] if self.has(key) else []
         if not isinstance(value, list):
             raise self.wrong(key, "a list")
         return value
 
     def number(self, key: str, default: float | None = None, *, low: float = -LARGEST_NUMBER) -> float:
-        """The finite number under a key, from ``low`` to LARGEST_NUMBER."""
+        """Return the finite number under a key, from ``low`` to LARGEST_NUMBER."""
         if not self.has(key) and default is not None:
             return default
         value = as_number(self.values.get(key))
@@ -194,18 +194,18 @@ class DocumentSection:
         return value
 
     def optional(self, key: str) -> float | None:
-        """The finite number under a key; None where there is none."""
+        """Return the finite number under a key; None where there is none."""
         return self.number(key) if self.has(key) else None
 
     def whole(self, key: str, default: int = 0) -> int:
-        """The whole number from 0 under a key."""
+        """Return the whole number from 0 under a key."""
         value = self.number(key, default, low=0.0)
         if value != int(value):
             raise self.wrong(key, "a whole number")
         return int(value)
 
     def text(self, key: str, default: str = "") -> str:
-        """The text under a key."""
+        """Return the text under a key."""
         if not self.has(key):
             return default
         if not isinstance(self.values[key], str | int | float) or isinstance(self.values[key], bool):
@@ -213,26 +213,26 @@ class DocumentSection:
         return str(self.values[key])
 
     def yes(self, key: str) -> bool:
-        """The true or false under a key."""
+        """Return the true or false under a key."""
         value = self.values.get(key)
         if not isinstance(value, bool):
             raise self.wrong(key, "true or false")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
-        """The texts of the list under a key."""
+        """Return the texts of the list under a key."""
         found = self.items(key)
         if not all(isinstance(v, str) for v in found):
             raise self.wrong(key, "a list of texts")
         return tuple(found)
 
     def numbers(self, key: str) -> dict[str, float | None]:
-        """The numbers under the keys of the mapping under a key; null stays None."""
+        """Return the numbers under the keys of the mapping under a key; null stays None."""
         inside = self.section(key)
         return {str(name): inside.optional(name) for name in inside.values}
 
     def array(self, key: str, *shape: int) -> Array:
-        """The finite numbers (shape) of the nested lists under a key; -1 in the shape: any length."""
+        """Return the finite numbers (shape) of the nested lists under a key; -1 in the shape: any length."""
         try:
             value = np.array(self.values.get(key), dtype=float)
         except (TypeError, ValueError, OverflowError):
@@ -244,7 +244,7 @@ class DocumentSection:
         return value
 
     def wrong(self, key: str, wanted: str) -> InputError:
-        """The sentence for a value that is not what was wanted."""
+        """Return the sentence for a value that is not what was wanted."""
         return InputError(f"'{self.file}': {self._at(key)} must be {wanted}, not {shown(self.values.get(key))}.")
 
     def _at(self, key: str) -> str:
@@ -252,7 +252,7 @@ class DocumentSection:
 
 
 def as_number(value: Any) -> float:
-    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text).
+    """Return a number, or a text that is one (YAML 1.1 leaves 1e-05 as text).
 
     NaN for anything else, true and false included.
     """
@@ -263,7 +263,7 @@ def as_number(value: Any) -> float:
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it: short, on one line."""
+    """Return a value as a message shows it: short, on one line."""
     if value is None:
         return "nothing"
     text = (
@@ -294,7 +294,7 @@ def did_you_mean(word: str, known: Iterable[str], otherwise: str, likeness: floa
 
 
 def read_part(kind: type[Part], document: Any, file: str, place: str = "") -> Part:
-    """A part of a file as its dataclass; ``place`` names the part in messages, such as `tip`.
+    """Return a part of a file as its dataclass; ``place`` names the part in messages, such as `tip`.
 
     Raises:
         InputError: an unknown key, a missing value, or one of another type; the message names file and key.

@@ -124,7 +124,7 @@ def opened(path: Path, limit: int = LARGEST_BYTES) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int = LARGEST_BYTES) -> bytes:
-    """The contents of a regular file. Raises InputError as ``opened``."""
+    """Return the contents of a regular file. Raises InputError as ``opened``."""
     with opened(path, limit) as stream:
         content = stream.read(limit + 1)
     if len(content) > limit:  # a file of the kernel's, whose size is not stated
@@ -133,7 +133,7 @@ def read_bytes(path: Path, limit: int = LARGEST_BYTES) -> bytes:
 
 
 def read_text(path: Path, limit: int = LARGEST_TABLE) -> str:
-    """The text of a UTF-8 file, with or without a byte-order mark.
+    """Return the text of a UTF-8 file, with or without a byte-order mark.
 
     Raises:
         InputError: as ``opened``; it is UTF-16, in another encoding, or not text.
@@ -142,7 +142,7 @@ def read_text(path: Path, limit: int = LARGEST_TABLE) -> str:
 
 
 def decoded(path: Path, content: bytes) -> str:
-    """The text of bytes that were read from ``path``. Raises InputError as read_text."""
+    """Return the text of bytes that were read from ``path``. Raises InputError as read_text."""
     if content.startswith(_UTF16):
         raise InputError(f"'{path.name}' cannot be read as text: it is UTF-16; save it as UTF-8.")
     if b"\0" in content:

@@ -128,7 +128,7 @@ def flange_ring(
     bore_depth_m: float = math.inf,
     chamfer_m: float = 0.001,
 ) -> FlangeStandard:
-    """A flange-like ring without holes (a tool's calibration ring, the rim of a wrist); diameters in metres."""
+    """Return a flange-like ring without holes (a tool's calibration ring, the rim of a wrist); diameters in metres."""
     return FlangeStandard(
         designation=designation,
         pitch_circle_m=outer_m,
@@ -168,7 +168,7 @@ STANDARDS: dict[str, FlangeStandard] = {
 
 
 def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStandard:
-    """The flange of that designation, also as catalogues write it ("ISO 9409-1 - 50 - 4 - M6", "50-4-M6").
+    """Return the flange of that designation, also as catalogues write it ("ISO 9409-1 - 50 - 4 - M6", "50-4-M6").
 
     `pin_angle_rad` moves the dowel hole, which is at 90 degrees otherwise.
 
@@ -199,7 +199,7 @@ def flange_mesh(
     holes: bool = True,
     segments: int = CIRCLE_SEGMENTS,
 ) -> TriMesh:
-    """The solid flange in frame R: face at z = 0 looking +z, watertight, blind bore and holes.
+    """Return the solid flange in frame R: face at z = 0 looking +z, watertight, blind bore and holes.
 
     `chamfers` = False leaves sharp edges (the vendors' CAD, which biases ICP); a bore at least as deep as the flange is
     thick goes through. Raises InputError when the thickness cannot hold the holes.

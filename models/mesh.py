@@ -41,7 +41,7 @@ class _Later:
 
 
 class _Stub(ModuleType):
-    """Stands for a package while Open3D is imported."""
+    """Take the place of a package while Open3D is imported."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -71,7 +71,7 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class TriMesh:
-    """Vertices (N,3) in metres and triangles (M,3) of vertex indices, counter-clockwise seen from outside."""
+    """Hold vertices (N,3) in metres and triangles (M,3) of vertex indices, counter-clockwise from outside."""
 
     vertices: Floats
     triangles: Ints
@@ -121,7 +121,7 @@ class TriMesh:
         return TriMesh(self.vertices @ X.rotation().matrix().T + X.translation(), self.triangles)
 
     def flipped(self) -> TriMesh:
-        """The same surface facing the other way."""
+        """Return the same surface with its normals reversed."""
         return TriMesh(self.vertices, self.triangles[:, ::-1])
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -155,7 +155,7 @@ class TriMesh:
         return f"{v}\n{vn}\n{f}\n"
 
     def to_drake(self, hint: str) -> Mesh:
-        """The mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
+        """Return the mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
         from pydrake.geometry import InMemoryMesh, Mesh
 
         return Mesh(InMemoryMesh(mesh_file=MemoryFile(self.to_obj(), ".obj", hint)))
@@ -237,7 +237,7 @@ def _triangulated(outlines: tuple[bytes, ...]) -> Ints:
 
 
 def plane_mesh(points: Floats, triangles: Ints, z_m: float, up: bool) -> TriMesh:
-    """A flat face (points (N,2)) at height z, facing +z when `up`, else -z."""
+    """Return a flat face (points (N,2)) at height z, facing +z when `up`, else -z."""
     return TriMesh(np.column_stack([points, np.full(len(points), z_m)]), triangles if up else triangles[:, ::-1])
 
 

@@ -45,7 +45,7 @@ class ProfilerPreset:
 
 
 def make_scene(mesh: TriMesh) -> Any:
-    """A mesh made ready for rays: Open3D's RaycastingScene."""
+    """Return a mesh made ready for rays: Open3D's RaycastingScene."""
     from weldcal.models.mesh import o3d  # slow to import
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -72,7 +72,7 @@ def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: Pro
 
 
 def with_noise(profiles: Floats, preset: ProfilerPreset, rng: np.random.Generator) -> Floats:
-    """The same profiles (..., 2) as a real sensor returns them."""
+    """Return the same profiles (..., 2) as a real sensor returns them."""
     p = np.array(profiles, float)
     shape = p.shape[:-1]
     p[..., 0] += preset.sigma_x_m * rng.standard_normal(shape)

@@ -13,8 +13,11 @@ from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
 
 @dataclass(frozen=True)
 class BaseCircle:
-    """The upper face of the foot: ``standard`` says its outer and inner edge, ``X_BR`` (frame R as a flange's: origin
-    at the circle's centre in the face, z out of it) where the drawing puts it in the base."""
+    """Describe the upper face of the foot.
+
+    ``standard`` has its outer and inner edge. ``X_BR`` is its pose in the base on the drawing. Frame R is as a
+    flange's: origin at the circle's centre in the face, z out of the face.
+    """
 
     standard: FlangeStandard
     X_BR: RigidTransform
@@ -27,7 +30,7 @@ _FEET = {"ur10e": (0.190, 0.166, 0.014)}
 
 
 def base_circle(arm: str) -> BaseCircle:
-    """The base-mounting circle of that arm (flange paper, Fig. 14a).
+    """Return the base-mounting circle of that arm (flange paper, Fig. 14a).
 
     Raises InputError naming the arms whose foot is known.
     """
@@ -104,8 +107,11 @@ def _ur(
     designation: str = ISO_50,
     **sources: str,
 ) -> Robot:
-    """A robot of Universal Robots: payload (kg), reach and repeatability (m) from ``sheet`` but for what ``sources``
-    names; ``mesh`` shows the dowel hole at -y of the tool frame."""
+    """Describe a robot of Universal Robots.
+
+    Payload (kg), reach and repeatability (m) are from ``sheet`` but for what ``sources`` names. ``mesh`` shows the
+    dowel hole at -y of the tool frame.
+    """
     payload, reach, repeatability = numbers
     name = model.lower()
     stated = dict.fromkeys(("flange", "payload", "reach", "repeatability"), sheet) | sources
@@ -134,7 +140,7 @@ def _ur(
 
 
 def _franka(name: str, title: str, **sources: str) -> Robot:
-    """A Franka arm. The maker's meshes disagree on the dowel hole (hand.dae: +x, link7.dae: +y)."""
+    """Return a Franka arm. The maker's meshes disagree on the dowel hole (hand.dae: +x, link7.dae: +y)."""
     return Robot(
         name=name,
         title=title,

@@ -103,7 +103,7 @@ class ScannerStream:
         return np.asarray(np.arange(n) * self.period_s + self.period_jitter_s * rng.standard_normal(n))
 
     def delay(self, rng: np.random.Generator) -> float:
-        """The transport delay of one frame, s."""
+        """Return the transport delay of one frame, s."""
         return float(self.shortest_delay_s + rng.gamma(2.0, self.delay_jitter_s / np.sqrt(2.0)))
 
     def arrivals(self, captures: Array, rng: np.random.Generator) -> Array:
@@ -111,7 +111,7 @@ class ScannerStream:
         return np.asarray(np.maximum.accumulate([t + self.delay(rng) for t in captures]))
 
     def device_time(self, capture_s: float, rng: np.random.Generator) -> float:
-        """The device's stamp, s of its own clock, of a frame captured at ``capture_s`` of the robot's."""
+        """Return the device's stamp, s of its own clock, of a frame captured at ``capture_s`` of the robot's."""
         exact = self.device_epoch_s + capture_s * (1.0 + 1e-6 * self.device_drift_ppm)
         stamped = exact + self.device_jitter_s * float(rng.standard_normal())
         return float(np.round(stamped / self.device_quantum_s) * self.device_quantum_s)
@@ -125,7 +125,7 @@ STREAMS: dict[str, ScannerStream] = {
 
 
 def get_stream(name: str) -> ScannerStream:
-    """The timing of the named scanner preset; raises InputError naming those that stream."""
+    """Return the timing of the named scanner preset; raises InputError naming those that stream."""
     stream = STREAMS.get(name.strip().lower().replace("-", "_"))
     if stream is None:
         raise InputError(f"Scanner '{name}' does not stream: use one of {', '.join(STREAMS)}.")

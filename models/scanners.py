@@ -107,7 +107,7 @@ class ReadScanner:
 
 
 def read_scanner_file(path: Path) -> ReadScanner:
-    """The scanner of a file.
+    """Return the scanner of a file.
 
     Raises:
         InputError: the file cannot be read, has an unknown key, or describes a scanner that cannot be.
@@ -217,7 +217,7 @@ class ScannerPreset:
         return measured_points(points_C, self.noise, (self.fx, self.fy, self.cx, self.cy, self.width, self.height))
 
     def resized(self, width: int, height: int | None = None) -> ScannerPreset:
-        """The same view in another resolution; the image corners, not the pixel centres, stay where they are."""
+        """Return the same view in another resolution; the image corners, not the pixel centres, stay where they are."""
         height = round(self.height * width / self.width) if height is None else height
         if width < 8 or height < 8:
             raise InputError("A scanner image needs at least 8 x 8 pixels: ask for a larger width and height.")
@@ -247,7 +247,7 @@ class DrakeIntrinsics:
 
 
 def drake_intrinsics(preset: ScannerPreset) -> DrakeIntrinsics:
-    """The preset for Drake's RgbdSensor, which samples pixel (u, v) at (u + 0.5, v + 0.5): half a pixel more."""
+    """Return the preset for Drake's RgbdSensor, which samples pixel (u, v) at (u + 0.5, v + 0.5): half a pixel more."""
     return DrakeIntrinsics(preset.width, preset.height, preset.fx, preset.fy, preset.cx + 0.5, preset.cy + 0.5)
 
 
@@ -334,13 +334,15 @@ SCANNERS: dict[str, ScannerPreset] = {
 
 
 def is_scanner_file(name: str) -> bool:
-    """Whether a preset's name is that of a file."""
+    """Return whether a preset's name is that of a file."""
     return name.lower().endswith((".yaml", ".yml"))
 
 
 def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
-    """The named scanner, or that of a file (.yaml), resized when a width (and height) is given; raises InputError
-    naming the known ones, or what is wrong in the file."""
+    """Return the named scanner, or that of a file (.yaml), resized when a width (and height) is given.
+
+    Raises InputError that names the known scanners, or what is wrong in the file.
+    """
     if is_scanner_file(name):
         preset: ScannerPreset | None = ScannerPreset(**vars(read_scanner_file(Path(name))))
     else:

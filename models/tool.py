@@ -63,7 +63,7 @@ class Seat(NamedTuple):
 
 
 def flipped_where_it_is(X: RigidTransform) -> RigidTransform:
-    """The pose with R_FLIPPED as its rotation where it differs from that by rounding only."""
+    """Return the pose with R_FLIPPED as its rotation where it differs from that by rounding only."""
     same = np.abs(X.rotation().matrix() - R_FLIPPED.matrix()).max() < 1e-12
     return RigidTransform(R_FLIPPED, X.translation()) if same else X
 
@@ -75,7 +75,7 @@ class WeldingTool:
     The defaults are the welding tool of the paper's figure; a tool file gives the fields at the end, which replace what
     follows from the others (models/tools).
 
-    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper); the tag rides
+    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper). The tag rides
     on it and the finger camera looks at the tag along +z_F. The torch trails the tip by `chord_m` along -x_T.
     """
 
@@ -219,7 +219,7 @@ class WeldingTool:
         return straight if X_TM.IsNearlyEqualTo(straight, 1e-12) else X_TM
 
     def drawn(self) -> tuple[ToolShape, ...]:
-        """The bodies on the flange, besides ring, finger and tag.
+        """Return the bodies on the flange, besides ring, finger and tag.
 
         Those of the tool's file, or those of the welding tool.
         """

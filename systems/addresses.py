@@ -15,7 +15,7 @@ class AddressError(InputError):
 
 
 def controller_address(text: str) -> str:
-    """The IPv4 address, or the host name, of a robot's controller.
+    """Return the IPv4 address, or the host name, of a robot's controller.
 
     Raises:
         AddressError: with the reason and an example.
@@ -50,7 +50,7 @@ def _name(word: str, give: str) -> str:
 
 
 def own_address(text: str) -> str:
-    """An IP address to listen on, IPv4 or IPv6; `localhost` is 127.0.0.1.
+    """Return an IP address to listen on, IPv4 or IPv6; `localhost` is 127.0.0.1.
 
     Raises:
         AddressError: with an example.
@@ -67,7 +67,7 @@ def own_address(text: str) -> str:
 
 
 def is_loopback(text: str) -> bool:
-    """Whether only this machine can reach that address."""
+    """Return whether only this machine can reach that address."""
     try:
         return ipaddress.ip_address(text).is_loopback
     except ValueError:
@@ -75,7 +75,7 @@ def is_loopback(text: str) -> bool:
 
 
 def loopback_address(text: str) -> str:
-    """An IPv4 address 127.x.y.z.
+    """Return an IPv4 address 127.x.y.z.
 
     Raises:
         AddressError: it is another address, or none.

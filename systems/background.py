@@ -29,7 +29,7 @@ class BackgroundFailed(WeldcalError):
 
 @dataclass(frozen=True, eq=False)
 class Answer(Message, Generic[Found]):
-    """A computation under way: a system keeps it in its state and looks at each of its updates whether it is ready."""
+    """Hold a running computation: a system has it in its state and checks at each update whether it is ready."""
 
     future: "Future[Found]"
 
@@ -205,7 +205,7 @@ class BackgroundSystem(LeafSystem):
         raise NotImplementedError
 
     def newest(self, context: Context) -> Any:
-        """The present output in this system's context."""
+        """Return the present output in this system's context."""
         return context.get_abstract_state(self._work).get_value().newest
 
     def _update(self, context: Context, state: State) -> None:

@@ -51,7 +51,7 @@ def ignore_signals() -> None:
 
 
 def received() -> bool:
-    """Whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
+    """Return whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
     return _Now.count > 0
 
 

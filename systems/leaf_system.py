@@ -30,7 +30,7 @@ DECLARATIONS = (
 
 
 def without_owner(callback: Any) -> Any:
-    """The callback with a weak reference to the object whose method it is (a `partial` of a method too).
+    """Return the callback with a weak reference to the object whose method it is (a `partial` of a method too).
 
     Any other as it is.
     """

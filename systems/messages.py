@@ -197,7 +197,7 @@ class CalibrationStatus(Message):
     refinement: Refinement | None = None
 
     def arm_or(self, arm: ArmModel) -> ArmModel:
-        """The arm with the kinematics that the refinement found, else the given one."""
+        """Return the arm with the kinematics that the refinement found, else the given one."""
         found = None if self.refinement is None else self.refinement.arm
         return arm if found is None else found
 
@@ -268,7 +268,7 @@ class PlannedSeam(Message):
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:
-    """The arm with refined kinematics of a `calibration_status` port.
+    """Return the arm with refined kinematics of a `calibration_status` port.
 
     The given one where the port is open or has none.
     """

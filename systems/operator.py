@@ -51,7 +51,7 @@ class Operator:
         self._holds.set()
 
     def go_on(self) -> None:
-        """Go on along the same path, from where the arm stands; a weld goes back a little first."""
+        """Continue along the same path, from where the arm is; a weld goes back a little first."""
         self._holds.clear()
 
     def end(self, by: str = "the terminal") -> None:

@@ -139,7 +139,7 @@ class HostTiming:
         )
 
     def summary(self) -> dict[str, float]:
-        """The JSON object."""
+        """Return the JSON object."""
         return {"wake_ups": self.wake_ups, "late_percent": self.late_percent, "worst_ms": self.worst_ms}
 
 

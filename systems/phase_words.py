@@ -92,7 +92,7 @@ PROFILER_STEPS = {
 
 
 def phase_words(phase: str, detail: str = "") -> str:
-    """A phase in words, with a detail after a comma.
+    """Return a phase in words, with a detail after a comma.
 
     A phase that is not listed (of an installed job) as it is written.
     """

@@ -308,12 +308,12 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
 
 
 def _of_second(name: str) -> str:
-    """The name of a port or system of the second arm, from that which its driver gave it."""
+    """Return the name of a port or system of the second arm, from that which its driver gave it."""
     return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 
 def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
-    """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
+    """Return the welding tool with the scenario's press deflections and the groove angle of the workpiece."""
     loaded, welding, camera = scenario.loaded_tool(), scenario.welding, scenario.finger_camera
     if loaded is None:
         return None
@@ -338,7 +338,7 @@ def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
 def _workpieces(
     scenario: Scenario, rng: np.random.Generator
 ) -> tuple[WeldPart | None, WeldPart | None, RigidTransform | None]:
-    """The nominal part, the true part, and the true pose."""
+    """Return the nominal part, the true part, and the true pose."""
     spec = scenario.workpiece
     if spec is None:
         return None, None, None
@@ -356,7 +356,7 @@ def _workpieces(
 
 
 def _plates(spec: WorkpieceConfig, rng: np.random.Generator) -> tuple[WeldPart, WeldPart]:
-    """The nominal plate, and the true one."""
+    """Return the nominal plate, and the true one."""
     length = spec.length_mm * 1e-3
     cad = make_workpiece(spec.shape, length_m=length)
     X_PG = seeded_groove_error(rng, spec.groove_error.translation_mm * 1e-3, np.deg2rad(spec.groove_error.rotation_deg))

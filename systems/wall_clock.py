@@ -36,7 +36,7 @@ class LostTime:
         corners.append((clock_s, total))
 
     def at(self, clock_s: float) -> float:
-        """The time lost by a time of the clock, s.
+        """Return the time lost by a time of the clock, s.
 
         Before the first corner that is kept as at it, after the newest as at that.
         """
@@ -141,7 +141,7 @@ class WallClock:
 
     @classmethod
     def following(cls, robot_time: Callable[[], float]) -> "WallClock":
-        """A clock that waits for the robot's own time (s), for an emulated robot that waits for this computer.
+        """Return a clock that waits for the robot's own time (s), for an emulated robot that waits for this computer.
 
         Neither gets ahead of the other, however slow both are. The path is not slowed: a robot that waits loses
         nothing.
@@ -199,7 +199,7 @@ class WallClock:
             self.lost_s += late if moving else 0.0
 
     def diagram_time(self, clock_s: float, now: float) -> float:
-        """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited.
+        """Return the Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited.
 
         `now`, too, for what lies more than LATE_S ahead: the Diagram has stood, and will go on from where it is.
         """
@@ -251,7 +251,7 @@ class WallClock:
             self.slowest_rate = min(self.slowest_rate, self.rate)
 
     def summary(self) -> dict[str, object]:
-        """The JSON values of a paced run."""
+        """Return the JSON values of a paced run."""
         found: dict[str, object] = {
             "late_ms": 1e3 * self.late_s,
             "thinking_ms": 1e3 * self.thinking_s,
@@ -265,7 +265,7 @@ class WallClock:
         return found
 
     def sentence(self) -> str | None:
-        """A warning where the run did not keep up with its robot; None where it did."""
+        """Return a warning where the run did not keep up with its robot; None where it did."""
         if not self.reanchored:
             return None
         times = "once" if self.reanchored == 1 else f"{self.reanchored} times"

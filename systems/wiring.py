@@ -61,7 +61,7 @@ class Wiring:
                 self.builder.Connect(source, system.GetInputPort(port))
 
     def out(self, name: str) -> OutputPort:
-        """An output port of the station."""
+        """Return an output port of the station."""
         port = self.station.diagram.GetOutputPort(name)
         self.read[name] = port
         return port
@@ -72,11 +72,11 @@ class Wiring:
         self.driven[name] = source
 
     def constant(self, name: str, value: object) -> OutputPort:
-        """An output port with a constant message."""
+        """Return an output port with a constant message."""
         return self.add(name, ConstantValueSource(AbstractValue.Make(value))).get_output_port()
 
     def zeros(self, name: str, size: int) -> OutputPort:
-        """A vector port of zeros."""
+        """Return a vector port of zeros."""
         return self.add(name, ConstantVectorSource(np.zeros(size))).get_output_port()
 
 

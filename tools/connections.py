@@ -156,7 +156,7 @@ def end_surplus(port: int) -> None:
 
 
 def network_address() -> str:
-    """The address of this computer on its network; 127.0.0.1 where there is none. Nothing is sent."""
+    """Return the address of this computer on its network; 127.0.0.1 where there is none. Nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # an address of documentation

@@ -120,7 +120,7 @@ NAMES = {
 
 
 def rows(result: Mapping[str, object]) -> dict[str, str]:
-    """The result's short values as printed, by name, without matrices and `state`.
+    """Return the result's short values as printed, by name, without matrices and `state`.
 
     A list of {id, reason} becomes one row per id, so that every refusal is named.
     """
@@ -173,7 +173,7 @@ def emit_text(text: str) -> None:
 
 
 def _sentence(text: str) -> str:
-    """A sentence for stderr: one line, which a terminal gets wrapped between words."""
+    """Return a sentence for stderr: one line, which a terminal gets wrapped between words."""
     line = f"weldcal: {text}"
     if not sys.stderr.isatty():
         return line
@@ -232,7 +232,7 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
 
 
 def _ended(problem: BaseException) -> str:
-    """The sentence of a command that a signal ended; it names the folder whose result is not complete."""
+    """Return the sentence of a command that a signal ended; it names the folder whose result is not complete."""
     folders = getattr(problem, "__notes__", ())
     begun = f"The result in '{folders[0]}' is not complete (UNFINISHED): run the command again." if folders else ""
     return f"The operator ended the command. {begun or 'It leaves no incomplete result.'}"

@@ -66,7 +66,7 @@ class CameraFile:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """The camera of a file.
+    """Return the camera of a file.
 
     Raises:
         DatasetError: the file cannot be read, states no camera, or a lens model that OpenCV's pinhole model does not
@@ -81,9 +81,9 @@ def read_camera(path: Path) -> CameraFile:
     name, K, dist = path.name, found.K, found.distortion
     if any(word in found.model for word in _FISHEYE):
         raise DatasetError(
-            f"'{name}' states the lens model '{found.model.strip()}'; pinhole cameras with radial and tangential"
-            " distortion are read: calibrate the camera with OpenCV's calibrateCamera, or leave the file out and let"
-            " the camera be estimated."
+            f"'{name}' has the lens model '{found.model.strip()}'. Only pinhole cameras with radial and tangential"
+            " distortion can be read. Calibrate the camera with OpenCV's calibrateCamera, or leave the file out: the"
+            " camera is then estimated."
         )
     if dist.size not in _COUNTS:
         raise DatasetError(
@@ -95,7 +95,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def find_camera(path: Path) -> CameraFile | None:
-    """The camera of a file as it is stated, not checked; None where it states none.
+    """Return the camera of a file as it is stated, not checked; None where it states none.
 
     Raises InputError where it cannot be read.
     """

@@ -79,7 +79,7 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
 
 
 def cut_off(path: Path) -> str | None:
-    """A sentence where a CSV file seems to end within its last row, None else.
+    """Return a sentence where a CSV file seems to end within its last row, None else.
 
     That row has fewer cells than the header, or no line break follows it and its last number is shorter than all others
     of its column. Raises what read_rows raises.
@@ -236,7 +236,7 @@ def cloud_form(header: DatasetHeader, folder: Path) -> CloudForm:
 
 
 def is_motion(folder: Path) -> bool:
-    """Whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+    """Return whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
     path = Path(folder) / "dataset.yaml"
     try:
         return path.is_file() and read_header(path).mode == "motion"
@@ -245,7 +245,7 @@ def is_motion(folder: Path) -> bool:
 
 
 def is_carried(folder: Path) -> bool:
-    """Whether a folder's dataset.yaml is of scans at rest by a scanner that an arm carries.
+    """Return whether a folder's dataset.yaml is of scans at rest by a scanner that an arm carries.
 
     False where it cannot be read.
     """
@@ -373,7 +373,7 @@ def row_numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> li
 
 
 def unit_quaternion(wxyz: list[float], where: str) -> RotationMatrix:
-    """The rotation of a unit quaternion (4,), wxyz. Raises DatasetError naming ``where``."""
+    """Return the rotation of a unit quaternion (4,), wxyz. Raises DatasetError naming ``where``."""
     norm = math.hypot(*wxyz)
     if not abs(norm - 1.0) < 1e-3:
         raise DatasetError(

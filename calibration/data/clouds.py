@@ -56,18 +56,18 @@ _LONGEST_NUMBER = 100  # characters
 
 
 def ending_of(path: Path) -> str:
-    """The ending of a cloud's file, one of SUFFIXES; the name's last one for another file."""
+    """Return the ending of a cloud's file, one of SUFFIXES; the name's last one for another file."""
     name = path.name.lower()
     return next((s for s in _PACKED if name.endswith(s)), path.suffix.lower())
 
 
 def cloud_id(path: Path) -> str:
-    """The name of a cloud's file without its ending."""
+    """Return the name of a cloud's file without its ending."""
     return path.name[: len(path.name) - len(ending_of(path))]
 
 
 def find_cloud(folder: Path, id: str) -> Path:
-    """The one cloud file of an id. Raises CloudError when there is none or more than one."""
+    """Return the one cloud file of an id. Raises CloudError when there is none or more than one."""
     found = sorted(p for p in folder.iterdir() if ending_of(p) in SUFFIXES and cloud_id(p) == id)
     found = [p for p in found if ending_of(p) in NO_NOTES] or [p for p in found if ending_of(p) not in IMAGES] or found
     if not found:
@@ -81,7 +81,7 @@ def read_cloud(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are
+    centres at whole numbers. Zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are
     the first three columns, below a header or none. Points with NaN or at 0 0 0 were not measured: they are NaN in
     organised clouds and left out of lists. A list in the sensor's order that keeps them becomes organised.
 
@@ -294,7 +294,7 @@ def _number(cell: str, separator: str) -> float | None:
 
 
 def _could_be_decimals(cells: list[str]) -> bool:
-    """Whether each two whole numbers of a row could be one with a decimal comma: no sign behind the comma."""
+    """Return whether each two whole numbers of a row could be one with a decimal comma: no sign behind the comma."""
     return (
         len(cells) >= 6
         and len(cells) % 2 == 0

@@ -87,7 +87,7 @@ class Dataset(Recorded):
     one first."""
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
-        """The dataset with its poses in another of its readings."""
+        """Return the dataset with its poses in another of its readings."""
         poses = {id: as_transform(X) for id, X in zip(self.poses, reading.X, strict=True)}
         others = tuple(one for one in self.readings if one.form != reading.form)
         return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
@@ -154,11 +154,11 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
     numbers. ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be
     carried by an arm.
 
-    Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
-    unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
-    whose size shows the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name;
-    clouds themselves are read later. A scan
-    that repeats another one to the last digit is refused by name.
+    Raises DatasetError, one sentence, for what makes the whole folder unusable. That is a missing or wrong file, an
+    unknown unit or configuration, or a cell that is not a number. It is also a quaternion that is not a unit one, an
+    id given twice, or poses whose size shows the wrong unit. A cloud without a pose is an error. A pose without a cloud
+    is refused by name. Clouds themselves are read later. A scan that repeats another one to the last digit is refused
+    by name.
     """
     folder = Path(folder)
     if folder.is_file() and find_bag(folder) is None:
@@ -181,13 +181,13 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
         header = read_header(description)
     if header.mode == "motion":
         raise DatasetError(
-            f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read"
-            " it. This command needs scans at rest, with poses.csv."
+            f"'{folder.name}' is a recording in motion (mode: motion), and this command needs scans at rest, with"
+            " poses.csv. Give the recording to 'weldcal calibrate' or 'weldcal monitor'."
         )
     if header.configuration != CONFIGURATIONS[0] and not carried:
         raise DatasetError(
-            f"'{folder.name}' is of a scanner that an arm carries ({header.configuration}); only 'weldcal calibrate'"
-            " reads it. This command needs a scanner beside the robot (eye_on_base)."
+            f"'{folder.name}' has scans of a scanner on an arm ({header.configuration}), and this command needs a"
+            " scanner beside the robot (eye_on_base). Give the folder to 'weldcal calibrate'."
         )
     hashes = {} if bare else {"dataset.yaml": digest(description)}
     if header.poses is not None and header.poses.file:
@@ -234,7 +234,7 @@ def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None
 
 
 def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
-    """The source of poses that dataset.yaml names; None where it is a ROS recording."""
+    """Return the source of poses that dataset.yaml names; None where it is a ROS recording."""
     path = folder / name
     if not path.exists():
         raise DatasetError(
@@ -246,7 +246,7 @@ def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
 
 
 def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Dataset:
-    """A dataset in this package's own form: poses.csv with quaternions, and clouds/."""
+    """Return a dataset in this package's own form: poses.csv with quaternions, and clouds/."""
     hashes["poses.csv"] = digest(folder / "poses.csv")
     poses = _poses(folder / "poses.csv", header.units.poses)
     clouds, refused = _match(folder / "clouds", poses)
@@ -256,7 +256,7 @@ def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Datas
 def _recognised(
     folder: Path, header: DatasetHeader, source: Path | tuple[Path, ...], hashes: dict[str, str]
 ) -> Dataset:
-    """A dataset whose poses are in another form."""
+    """Return a dataset whose poses are in another form."""
     form = header.poses or PoseForm()
     found = read_poses(source, form)
     X, unit = metric_poses(found, header.units.poses, form)
@@ -277,7 +277,7 @@ def _recognised(
 
 
 def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:
-    """A dataset from a ROS recording; its clouds stay in memory."""
+    """Return a dataset from a ROS recording; its clouds stay in memory."""
     form = header.poses or PoseForm()
     found = read_bag(bag, form, robot or header.robot)
     listed = PoseList(source=bag.name, X=found.X, ids=found.ids, times=found.times, unit="m", read_as="a ROS recording")
@@ -312,7 +312,7 @@ def _finished(
     hashes: dict[str, str],
     notes: tuple[str, ...],
 ) -> Dataset:
-    """The dataset without unreadable clouds and scans that repeat another one."""
+    """Return the dataset without unreadable clouds and scans that repeat another one."""
     content, unreadable = _contents(clouds)
     clouds = {id: cloud for id, cloud in clouds.items() if id in content}
     refused += unreadable
@@ -442,8 +442,8 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
             else ("clouds: mm" if metres[1] else "poses: m")
         )
         raise DatasetError(
-            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
-            f"millimetres; correct units in dataset.yaml to '{cure}'."
+            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's. One of the two is "
+            f"in millimetres: correct units in dataset.yaml to '{cure}'."
         )
     check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
     return tuple(pairs)

@@ -88,7 +88,7 @@ class DatasetHeader:
 
     ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and ``depth_scale``
     (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means. Of a scanner that an arm
-    carries: ``scanner_guess`` is its pose on its carrier; ``scanner_link`` the link that carries it (eye_on_arm),
+    carries: ``scanner_guess`` is its pose on its carrier. ``scanner_link`` the link that carries it (eye_on_arm),
     ``second_robot`` the arm that shows its flange (co_manipulation), ``arm_error_mm`` the rms error of the flange's
     reported position.
     """
@@ -113,5 +113,5 @@ class DatasetHeader:
 
 
 def without_cloud_form(header: DatasetHeader) -> dict[str, Any]:
-    """The header as a document of plain values for clouds that are written in metres, in the sensor's frame."""
+    """Return the header as a document of plain values for clouds that are written in metres, in the sensor's frame."""
     return {k: v for k, v in asdict(header).items() if k not in ("intrinsics", "depth_scale", "viewpoint")}

@@ -166,7 +166,7 @@ def save_motion_dataset(
     """Record a motion as a folder that load_motion_dataset reads back.
 
     ``clouds`` gives (id, points in metres (N, 3) or (H, W, 3)) one after the other, so that they need not be in memory
-    together; ``intrinsics`` writes organised clouds as depth maps.
+    together. ``intrinsics`` writes organised clouds as depth maps.
 
     The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and
     metres.
@@ -215,7 +215,7 @@ def read_stream(path: Path, *, robot: str = "", unit: str = "m") -> tuple[RobotS
 
 
 def _read_stream(path: Path, header: DatasetHeader, robot: str) -> tuple[RobotStream, list[str]]:
-    """The stream, and sentences about rows that were left out."""
+    """Return the stream, and sentences about rows that were left out."""
     try:
         names, rows = read_rows(path)
     except InputError as e:
@@ -345,7 +345,7 @@ def _read_frames(path: Path, stream: RobotStream) -> tuple[list[FrameTime], list
 
 
 def _time(row: dict[str, str], column: str, path: Path) -> float | None:
-    """A time of a frame, s; None where the cell is empty or no finite number. Raises DatasetError for a word."""
+    """Return a time of a frame, s; None where the cell is empty or no finite number. Raises DatasetError for a word."""
     cell = row.get(column) or "nan"
     try:
         value = float(cell)

@@ -57,12 +57,12 @@ class IcpRecord:
 class CalibrationResult:
     """Contents of calibration.yaml.
 
-    ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin; ``joint_covariance`` (6 +
-    K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one; ``clock`` of the scanner and
+    ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin. ``joint_covariance`` (6 +
+    K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one. ``clock`` of the scanner and
     ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as they were
     estimated, where the calibration was made in motion. With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and
     ``target`` the centre (3,) m and normal (3,) of what was seen, in the base. ``axis_turn_deg`` how far the hole
-    pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of what --refine
+    pattern is turned about the flange's axis, and its spread over the scans. ``local_field``: document of what --refine
     local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
     ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean
     (quaternion wxyz) of the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses
@@ -137,7 +137,7 @@ def matrix4(X: RigidTransform) -> list[list[float]]:
 
 
 def pose_document(X: RigidTransform) -> dict[str, Any]:
-    """A pose as plain values: its matrix, position (m) and quaternion."""
+    """Return a pose as plain values: its matrix, position (m) and quaternion."""
     q = X.rotation().ToQuaternion().wxyz()
     return {"matrix": matrix4(X), "xyz": [float(v) for v in X.translation()], "wxyz": [float(v) for v in q]}
 
@@ -201,7 +201,7 @@ def _matrix(order: str, C: Array | None) -> dict[str, Any] | None:
 
 
 def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
-    """A fixed target's centre (m) and normal in the base as plain values."""
+    """Return a fixed target's centre (m) and normal in the base as plain values."""
     return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
 
 
@@ -235,7 +235,7 @@ def load_result(path: Path) -> CalibrationResult:
     document = read_document(path)
     if isinstance(document, dict) and "X_FC" in document:
         raise InputError(
-            f"'{path}' is of a scanner on the flange (X_FC); a scanner that stands beside the robot is needed here."
+            f"'{path}' is the calibration of a scanner on the flange (X_FC). Give one of a scanner beside the robot."
         )
     if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")
@@ -288,7 +288,7 @@ def load_result(path: Path) -> CalibrationResult:
 
 
 def _covariance(d: DocumentSection, key: str, size: int) -> Array:
-    """The matrix (size, size) of a covariance.
+    """Return the matrix (size, size) of a covariance.
 
     Raises InputError where it is not symmetric or has a negative variance.
     """
@@ -341,7 +341,7 @@ def _only(r: DocumentSection, kind: type) -> None:
 def export_urdf(
     X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame", note: str | None = None
 ) -> str:
-    """A xacro file for `xacro:include` into a robot that has the parent link.
+    """Return a xacro file for `xacro:include` into a robot that has the parent link.
 
     The child link on a fixed joint, one root element.
     """
@@ -359,7 +359,7 @@ def export_urdf(
 
 
 def export_ros2(X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame") -> str:
-    """The command line of ROS 2's static transform publisher."""
+    """Return the command line of ROS 2's static transform publisher."""
     x, y, z = X_BC.translation()
     qw, qx, qy, qz = _wxyz(X_BC)
     return (
@@ -369,7 +369,7 @@ def export_ros2(X_BC: RigidTransform, parent: str = "base", child: str = "scanne
 
 
 def export_ur_pose(X_BC: RigidTransform) -> str:
-    """A URScript pose: position m and rotation vector rad."""
+    """Return a URScript pose: position m and rotation vector rad."""
     return "p[" + ", ".join(f"{v:.9f}" for v in (*X_BC.translation(), *rotation_vector(X_BC.rotation()))) + "]\n"
 
 
@@ -406,7 +406,7 @@ def correction_note(result: CalibrationResult, file: Path | str | None = None) -
 
 
 def result_parent(result: CalibrationResult) -> str:
-    """The frame, as ROS calls it, that the scanner is fixed in."""
+    """Return the frame, as ROS calls it, that the scanner is fixed in."""
     return "base" if result.configuration == ON_BASE else "tool0"
 
 

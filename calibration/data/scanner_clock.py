@@ -18,8 +18,8 @@ class ScannerClock:
 
     ``kind`` arrival: capture = arrival - offset. ``kind`` device: capture = device + offset + drift (device -
     reference). ``offset_s`` is the mean over frames, ``sigma_s`` its standard deviation, both None where the motion
-    does not show them; ``jitter_s`` the standard deviation of single frames about it; ``reference_s`` the clock's time
-    that the offset holds for; ``drift`` and ``drift_sigma`` s/s (None for arrivals); ``rolling_s``: an image row y/z is
+    does not show them. ``jitter_s`` the standard deviation of single frames about it. ``reference_s`` the clock's time
+    that the offset holds for. ``drift`` and ``drift_sigma`` s/s (None for arrivals). ``rolling_s``: an image row y/z is
     exposed so much later per unit (None where the data do not show it). ``late``: ids of frames left out of the offset
     as grossly late or early; ``reason``: why this clock.
     """
@@ -55,7 +55,7 @@ class ScannerClock:
 
 
 def clock_from_document(value: Any, file: str) -> ScannerClock | None:
-    """The clock of a calibration.yaml; None without one. Raises InputError naming the key."""
+    """Return the clock of a calibration.yaml; None without one. Raises InputError naming the key."""
     if value is None:
         return None
     if not isinstance(value, Mapping) or value.get("kind") not in (ARRIVAL, DEVICE):

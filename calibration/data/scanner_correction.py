@@ -47,7 +47,7 @@ class ScannerCorrection:
 
     @classmethod
     def unchanged(cls, terms: int) -> "ScannerCorrection":
-        """The correction with that many terms (3, 6 or 10) that changes nothing: for its derivatives."""
+        """Return the correction with that many terms (3, 6 or 10) that changes nothing: for its derivatives."""
         return cls(bend=(0.0,) * (terms - 3))
 
     @property
@@ -66,14 +66,14 @@ class ScannerCorrection:
         return next(order for order, size in TERMS.items() if size == len(self.values))
 
     def factor(self, p_C: Array) -> Array:
-        """The factor (...) of points (..., 3): the sum of the terms, weighted by ``values``."""
+        """Return the factor (...) of points (..., 3): the sum of the terms, weighted by ``values``."""
         out = np.zeros(np.shape(p_C)[:-1])
         for term, value in zip(self._each(np.asarray(p_C, dtype=float)), self.values, strict=True):
             out += value * term
         return out
 
     def terms(self, p_C: Array) -> Array:
-        """The terms (..., K) at points (..., 3)."""
+        """Return the terms (..., K) at points (..., 3)."""
         return np.stack(list(self._each(np.asarray(p_C, dtype=float))), axis=-1)
 
     def _each(self, p: Array) -> Iterator[Array]:
@@ -125,7 +125,7 @@ class ScannerCorrection:
         return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
     def document(self) -> dict[str, Any]:
-        """The correction as plain types for calibration.yaml and JSON; bends only where there are any."""
+        """Return the correction as plain types for calibration.yaml and JSON; bends only where there are any."""
         out: dict[str, Any] = {"scale": float(self.scale), "gradient_per_m": [float(v) for v in self.gradient_per_m]}
         if self.bend:
             out["bend_per_m2"] = [float(v) for v in self.bend[:3]]
@@ -170,7 +170,7 @@ def correction_from_document(document: dict[str, Any] | None, file: str = "") ->
 
 
 def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
-    """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
+    """Return the correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
     limited = np.clip(change[0], -LARGEST, LARGEST)
     bend = tuple(float(v) for v in change[3:])
     return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)

@@ -234,7 +234,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> Array | None:
 
 
 def _said_mounting(text: str) -> str | None:
-    """The mounting that the text of a launch file names, such as EYE-IN-HAND."""
+    """Return the mounting that the text of a launch file names, such as EYE-IN-HAND."""
     if re.search(r"(?i)eye[-_ ](in|on)[-_ ]hand", text):
         return "eye_in_hand"
     return "eye_on_base" if re.search(r"(?i)eye[-_ ](to[-_ ]hand|on[-_ ]base)", text) else None

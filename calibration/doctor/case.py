@@ -46,11 +46,11 @@ class ArmDerivatives:
 class DoctorCase:
     """n scans of a flange.
 
-    X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m (n, 3)
-    in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face
-    about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
+    X_BF (n, 4, 4) as the robot states it. X_FR (4, 4) of the feature. Centres c (n, 3) m and outward normals m (n, 3)
+    in the camera (NaN rows: not found). ``time`` (n,) s or the order of the scans. ``noise`` (n,) m rms of each face
+    about its plane (NaN: unknown). ``coverage`` (n,) visible share of the edge.
 
-    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the
+    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as a user measured it, good to ``guess_radius`` m at the
     feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
     ``refused`` lists (id, reason); ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have
     positions only. Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
@@ -102,7 +102,7 @@ class DoctorCase:
         return np.asarray((t - t.min()) / span if span > 0.0 else np.linspace(0.0, 1.0, self.n))
 
     def with_poses(self, X_BF: Array) -> Self:
-        """The same scans with other robot poses, to which no errors of the arm are known."""
+        """Return the same scans with other robot poses, to which no errors of the arm are known."""
         return replace(self, X_BF=X_BF, arm=None)
 
     def pick(self, which: Which) -> Self:
@@ -139,7 +139,7 @@ def case_of(
     fits_flange: str = "",
     near_far: tuple[float, float] | None = None,
 ) -> DoctorCase:
-    """The case of observations in their order; X_FR (4, 4) is the feature in the flange."""
+    """Return the case of observations in their order; X_FR (4, 4) is the feature in the flange."""
     nan = np.full(3, np.nan)
     X_BR = np.array([o.X_BR.GetAsMatrix4() for o in observations]).reshape(-1, 4, 4)
     return DoctorCase(
@@ -195,7 +195,7 @@ def _six(X: Array) -> list[str]:
 
 
 def read_case(path: Path) -> DoctorCase:
-    """The case of such a table. Raises InputError where it is damaged."""
+    """Return the case of such a table. Raises InputError where it is damaged."""
     names, rows = read_rows(path)
     if tuple(names) != _COLUMNS:
         raise InputError(f"'{path.name}' is no table of observations that 'weldcal calibrate' wrote.")

@@ -1,7 +1,7 @@
 """Name the causes that the scans give evidence of, misread data among them, the likeliest first.
 
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the
-Bayesian information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a
+Bayesian information criterion (fit.py). The difference must exceed a threshold for each cause, and the disturbance a
 size that matters. The thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its
 false alarms are counted on.
 """
@@ -42,7 +42,7 @@ _NOISE_CHANCE = 1e-5  # a choice: ten false alarms in a million data sets; a fac
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Another way to read the poses: the cause's name, what it is in words, the case so read and its fit."""
+    """Hold another reading of the poses: the cause's name, its description, the case in that reading and its fit."""
 
     cause: str
     words: str
@@ -116,7 +116,7 @@ def looks_wrong(one: CauseFit) -> bool:
 
 
 def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
+    """Return the misreading whose correction lowers the criterion most, if what remains looks like a working cell's.
 
     Else None.
     """
@@ -137,7 +137,7 @@ def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
 
 
 def mixed_units(case: DoctorCase) -> tuple[DoctorCase, float, tuple[str, ...]] | None:
-    """The case in one unit, the factor and the scans that were in another one; None where all are in one.
+    """Return the case in one unit, the factor and the scans that were in another one; None where all are in one.
 
     Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those
     within the reach of an arm are in metres. Else one factor between the spreads of both sides.
@@ -327,7 +327,7 @@ def _off(u: Array, z: Array) -> float:
 
 
 def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
+    """Return the figures where the centres agree and the normals do not: wrong rotations of an unknown kind.
 
     None where both agree.
     """
@@ -397,7 +397,7 @@ class Diagnosis:
 
 
 def diagnose(case: DoctorCase) -> Diagnosis:
-    """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
+    """Return the causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
     if case.fits_flange and case.fits_flange != case.flange:
         causes.append(Cause("wrong flange size", 0.99, 1e8, {}, (), case.fits_flange))
@@ -488,7 +488,7 @@ def _weight(winner: Explained, models: list[Explained], null: CauseFit) -> float
 
 
 def _residuals(null: CauseFit, best: CauseFit) -> dict[str, float]:
-    """Medians of centres (mm) and, where normals were seen, of their angles (deg), without and with the cause."""
+    """Return medians of centres (mm) and, given normals, of their angles (deg), without and with the cause."""
     out = {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
     if np.isfinite(null.tilt).any() and np.isfinite(best.tilt).any():
         out |= {

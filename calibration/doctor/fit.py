@@ -31,8 +31,8 @@ class CauseFit:
 
     Residuals of centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
 
-    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers
-    with a prior cost: the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
+    ``size`` counts the free parameters, not those with a prior (the scanner's, the arm's). ``occam`` is the penalty of
+    those with a prior: the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
     """
 
     R: Array

@@ -83,7 +83,7 @@ def moved(case: DoctorCase) -> Explained | None:
 
 
 def tcp(case: DoctorCase, null: CauseFit) -> Explained | None:
-    """A constant offset in the flange's frame."""
+    """Return a constant offset in the flange's frame."""
     D = -case.X_BF[:, :3, :3]
     if case.n < 5:
         return None
@@ -103,7 +103,7 @@ def tcp(case: DoctorCase, null: CauseFit) -> Explained | None:
 
 
 def _faces_straight(case: DoctorCase, found: CauseFit) -> DoctorCase | None:
-    """The case with the poses turned so that the faces seen look along z.
+    """Return the case with the poses turned so that the scanned faces look along z.
 
     None where they do, or no normals were seen.
     """
@@ -132,7 +132,7 @@ def _tcp_starts(case: DoctorCase, null: CauseFit) -> Iterator[CauseFit]:
 
 
 def scaled(case: DoctorCase, null: CauseFit) -> Explained:
-    """The scanner's scale free of what is usual.
+    """Return the scanner's scale free of what is usual.
 
     Least squares along the undisturbed fit, then twice by the fit itself.
     """
@@ -224,7 +224,7 @@ def _two_states(case: DoctorCase, null: CauseFit, T: Array, state: Array) -> tup
 
 
 def _arm_of(case: DoctorCase) -> Chain | None:
-    """The arm of a case; None where it is not known, or has too few scans to judge it by."""
+    """Return the arm of a case; None where it is not known, or has too few scans to judge it by."""
     if not case.robot or case.n < FEWEST_FOR_ARM:
         return None
     try:
@@ -277,7 +277,7 @@ def with_arm_errors(case: DoctorCase) -> DoctorCase:
 
 
 def another_arm(case: DoctorCase, null: CauseFit, arm: Chain) -> Explained | None:
-    """The poses as another arm makes them from the same joint angles.
+    """Return the poses as another arm makes them from the same joint angles.
 
     None where no other arm explains the scans better.
     """

@@ -21,9 +21,9 @@ def sampling_advice(
 ) -> tuple[str, ...]:
     """Advice from an estimate and the observations that made it (outliers are ignored).
 
-    Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
-    field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard
-    deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
+    It names the directions in which positions vary too little, and whether orientations vary. It also names where in
+    the poses' own field a scanned point is worst known, and the gain of one more pose like these. With ``required_m``
+    (standard deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
     """
     used = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     if len(used) < 2:
@@ -94,12 +94,12 @@ def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
 
 
 def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
-    """Standard deviation (3-D, m) of a scanned point that is seen at ``p_BQ`` (3,) m."""
+    """Return the standard deviation (3-D, m) of a scanned point at ``p_BQ`` (3,) m."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BQ))))
 
 
 def _direction(axis: Array) -> str:
-    """The base axis that a direction follows most, or the two that share it."""
+    """Return the base axis that a direction follows most, or the two that share it."""
     order = np.argsort(-np.abs(axis))
     names = "xyz"
     if abs(axis[order[0]]) > 0.9:

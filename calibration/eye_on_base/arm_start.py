@@ -1,4 +1,4 @@
-"""Finds roughly where the scanner stands from the visible arm.
+"""Estimate the scanner's approximate pose from the visible arm.
 
 Its capsules at the recorded joints against one scan or more.
 """
@@ -62,8 +62,8 @@ class ArmShape:
 class ArmStart:
     """Where the scanner seems to stand.
 
-    ``explained``: share of the moving points on the arm; ``seen_through``: share of the arm's surface in view behind
-    which the scanner measured; ``next_best``: the score of the best other place; ``score`` of this one.
+    ``explained``: share of the moving points on the arm. ``seen_through``: share of the arm's surface in view behind
+    which the scanner measured. ``next_best``: the score of the best other place. ``score`` of this one.
     """
 
     X_BC: RigidTransform
@@ -94,7 +94,7 @@ class ArmStart:
         )
 
     def agreement(self, X_BC: RigidTransform, p_B: Array) -> str:
-        """A sentence on how well a calibration agrees with the arm at points (n, 3) m of the base.
+        """Return a sentence on how well a calibration agrees with the arm at points (n, 3) m of the base.
 
         Raises:
             InconsistentPoses: it does not.
@@ -113,7 +113,7 @@ class ArmStart:
 def see_with_arm(
     data: Dataset, seen: FlangeObservations, standard: FlangeStandard, robot: str, *, seed: int = 0
 ) -> tuple[FlangeObservations, ArmStart | None]:
-    """The flanges of scans, looked for where the visible arm puts them.
+    """Return the flanges of scans, looked for where the visible arm puts them.
 
     As they were seen where the arm decides nothing.
     """
@@ -138,7 +138,7 @@ def face_guess(points: Array, X_CR: RigidTransform, standard: FlangeStandard) ->
     The pose is right to some centimetres.
 
     The face is where most points lie on the ring, and fewest in the bore and just outside, on a plane
-    along the expected axis; plane and place are found in turns.
+    along the expected axis. Plane and place are found in turns.
 
     Raises:
         FlangeNotFound: no face is there.
@@ -231,7 +231,7 @@ def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
 
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
-    """The capsules of an arm at joint angles (n,) rad."""
+    """Return the capsules of an arm at joint angles (n,) rad."""
     frames = [np.eye(4), *joint_frames(arm.stack, q)]
     if arm.name in known_arms():
         rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(load_arm(arm.name))]
@@ -260,7 +260,7 @@ def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int =
     None where too little of the arm is seen.
 
     What stands still in two clouds or more is no arm. Points of a scan with their normals are laid on points of the
-    arm's surface, turned about the common normal; the scanner then must see the arm's surface wherever nothing hides
+    arm's surface, turned about the common normal. The scanner then must see the arm's surface wherever nothing hides
     it, and nothing behind it. The best hypotheses are refined by Gauss-Newton with a common allowance on the radii.
     """
     rng = np.random.default_rng(seed)
@@ -440,7 +440,7 @@ def _likely(X: Array, views: Sequence[_View], most: int) -> Array:
 
 
 def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
-    """The pose that lays the scans' points best on the arm, and the allowance (m) on its radii."""
+    """Return the pose that lays the scans' points best on the arm, and the allowance (m) on its radii."""
     X, allowance = X.copy(), 0.0
     for scale in np.geomspace(0.08, _FINE_M, 16):
         H, g = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 20.0]), np.zeros(7)
@@ -462,7 +462,7 @@ def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
 
 
 def _verdict(X: Array, views: Sequence[_View], allowance: float) -> tuple[float, float]:
-    """Mean shares over the scans: points on the arm, and surface seen through."""
+    """Return mean shares over the scans: points on the arm, and arm surface that the scanner looks through."""
     on, through = [], []
     for view in views:
         d = capsule_distance(view.points @ X[:3, :3].T + X[:3, 3], view.shape)[0]
@@ -472,7 +472,7 @@ def _verdict(X: Array, views: Sequence[_View], allowance: float) -> tuple[float,
 
 
 def _same(X: Array, Y: Array, views: Sequence[_View]) -> bool:
-    """Whether two poses put the arm's points to about the same place."""
+    """Return whether two poses put the arm's points to about the same place."""
     turn = float(angle_of(X[:3, :3].T @ Y[:3, :3]))
     middle = np.mean([view.points.mean(axis=0) for view in views], axis=0)
     far = float(np.linalg.norm((X[:3, :3] - Y[:3, :3]) @ middle + X[:3, 3] - Y[:3, 3]))

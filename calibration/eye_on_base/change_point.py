@@ -58,10 +58,10 @@ def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
     """The change of the camera's pose in observations (n) in the order of their recording; None where they show none.
 
     One camera pose is compared with two, for every place of a change that leaves four poses on either side. Both models
-    leave the scanner's own error open, held to its usual size, which a recording from near to far would else take for a
-    change. Centres only; Huber weights. A change is named if the F-test, corrected for the number of places, gives it a
-    probability by chance below FALSE_ALARM, and if it shifts the centres by more than three sigmas of a single pose and
-    0.1 mm. Deterministic. Fewer than nine poses show none.
+    leave the scanner's own error open, with a prior of its usual size. Otherwise a recording from near to far would
+    take that error for a change. Centres only; Huber weights. A change is named under two conditions. The F-test,
+    corrected for the number of places, gives it a probability by chance below FALSE_ALARM. And it shifts the centres
+    by more than three sigmas of a single pose and 0.1 mm. Deterministic. Fewer than nine poses show none.
     """
     n = len(observations)
     if n < _LEAST:

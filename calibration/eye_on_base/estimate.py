@@ -29,12 +29,12 @@ class HeldOut:
 class CalibrationEstimate:
     """Pose of the camera in the base with its covariance, residuals and held-out errors.
 
-    ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
-    base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
+    ``covariance`` (6, 6), order [rotation; translation], is of X_BC = (exp(dtheta) R, p + dp). dtheta (rad) is a
+    rotation on the base side about the camera origin. dp (m) is the displacement of the camera origin. Both are in B.
     ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
-    observations; the covariance is widened so that its Gaussian 95 % region holds the truth that often with few poses,
-    too. Where the scanner's errors were estimated it contains what that leaves open, and ``joint`` (6 + K, 6 + K) is
-    that of X_BC and the K factors of ``scanner`` together; a ``scanner`` that changes nothing was not found wrong.
+    observations. The covariance is enlarged so that its Gaussian 95 % region is right for few poses, too. Where the
+    scanner's errors were estimated, it contains their uncertainty. ``joint`` (6 + K, 6 + K) is then the covariance of
+    X_BC and the K factors of ``scanner`` together. A ``scanner`` that changes nothing was not found wrong.
     ``sigma_position_m`` and ``sigma_normal_rad`` (per axis) are the spread of robot and scanner together beyond the
     noise of the fits, estimated from the residuals.
     """
@@ -59,7 +59,7 @@ class CalibrationEstimate:
 
 
 def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
-    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m.
+    """Return the covariance (3, 3) m^2, in B, of the base position of a scanned point at ``p_BQ`` (3,) m.
 
     With a scanner correction, X_BC and correction err together: where both were seen, much of either cancels.
     """

@@ -47,7 +47,7 @@ def estimate_from_whole_poses(
     """X_BC from the observations whose hole pattern shows its rotation (n >= 1): each gives all six degrees of freedom.
 
     ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says
-    it is; ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged
+    it is. ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged
     (chordal mean), then centres. Raises TooFewPoses where no scan shows one.
     """
     seen = _with_turn(observations, patterns)
@@ -96,10 +96,10 @@ def _with_turn(observations: Sequence[Observation], patterns: Mapping[str, HoleP
     if seen:
         turns = (0.0, *(np.degrees(t) % 360.0 for t in patterns[seen[0].id].other_turns_rad))
         raise TooFewPoses(
-            "The scans show the flange's threads but not its dowel hole, so the rotation about the axis may be any of "
-            f"{', '.join(f'{t:.0f}' for t in sorted(turns))} degrees; clear the dowel hole or take four poses and more."
+            "The scans show the flange's threads but not its dowel hole. The rotation about the axis is therefore one of "
+            f"{', '.join(f'{t:.0f}' for t in sorted(turns))} degrees. Clear the dowel hole, or take four poses or more."
         )
-    raise TooFewPoses("No scan shows the flange's holes well enough; scan from nearer or take four poses and more.")
+    raise TooFewPoses("No scan shows the flange's holes well enough. Scan from nearer, or take four poses or more.")
 
 
 def calibrate_from_few(
@@ -128,8 +128,8 @@ def calibrate_from_few(
     if n < need:
         there = "One scan leaves" if n == 1 else "Two centres leave"
         raise TooFewPoses(
-            f"{there} a rotation open: take {ENOUGH} poses or more, whose flange centres do not lie in one plane, or"
-            " state how far the hole pattern is turned about the flange's axis with --axis-turn DEGREES (a calibration"
+            f"{there} a rotation open. Take {ENOUGH} poses or more, whose flange centres do not lie in one plane. Or"
+            " state the rotation of the hole pattern about the flange's axis with --axis-turn DEGREES (a calibration"
             " from many scans reports it)."
         )
     config = SolveConfig(seed=seed, min_poses=need, allow_coplanar=True, usual_weight=_USUAL_WEIGHT)
@@ -145,7 +145,7 @@ def _with_open_scanner(
     observations: Sequence[Observation],
     solve: Callable[[Sequence[Observation]], RigidTransform],
 ) -> CalibrationEstimate:
-    """The estimate with a covariance that holds what scanners are usually off: so few scans do not show it.
+    """Return the estimate with a covariance that holds what scanners are usually off: so few scans do not show it.
 
     Had the scanner needed the factors v, ``solve`` would have found X_BC moved by L v (derivative by differences).
     """

@@ -68,7 +68,7 @@ def estimate_jointly(
     correct_scanner: bool = True,
     config: SolveConfig | None = None,
 ) -> tuple[CalibrationEstimate, ScannerVerdict | None]:
-    """X_BC with a scanner correction from n poses (n >= 4) and the hole circles seen in them (by id).
+    """Estimate X_BC with a scanner correction from n poses (n >= 4) and the hole circles found in them (by id).
 
     The correction (order 2, from twelve poses on 3) is held to its usual size: scale 0.2 %, gradient 0.15 % per 100 mm,
     bends 0.1 % at the image's edge. So few poses state what they know. It is applied where it is not zero by chance (99

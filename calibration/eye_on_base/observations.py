@@ -110,7 +110,7 @@ def fit_flanges(
 
 
 def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
-    """The dataset with its poses in the reading that the scans select."""
+    """Return the dataset with its poses in the reading that the scans select."""
     ids = list(data.poses)
     reading, text = choose_reading(
         data.readings,
@@ -123,7 +123,7 @@ def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
 
 
 def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
-    """An observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
+    """Return an observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
     return replace(
         o, p_CR=correction.points(o.p_CR), n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C)
     )
@@ -140,7 +140,7 @@ def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, see
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:
-    """Where to look in this cloud, where the dataset or a calibration says roughly where the scanner stands."""
+    """Return where to look in this cloud, if the dataset or a calibration gives the scanner's approximate pose."""
     X_CR, reach = data.guess(id), _SEARCH_M
     if X_CR is not None and data.header.scanner_guess is not None:
         reach = data.header.scanner_guess.radius_m
@@ -181,13 +181,13 @@ class ScanAgreement:
 def choose_reading(
     readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
-    """The reading of the flange poses with which the scans agree, and a sentence about it.
+    """Return the reading of the flange poses with which the scans agree, and a sentence about it.
 
     None where the usual one stands.
 
     Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the
     rigid X_BC that fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom,
-    m of the n scans being no outliers, and more of centres; a reading whose residuals exceed those of the best by more
+    m of the n scans being no outliers, and more of centres. A reading whose residuals exceed those of the best by more
     than the quantile of F(2 m - 3, 2 m - 3) for CHANCE is rejected.
 
     Args:

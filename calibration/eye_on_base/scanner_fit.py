@@ -83,7 +83,7 @@ def from_motion(
 
     The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With
     ``usual`` it is held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton
-    over the 9, 12 or 16 unknowns, reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread,
+    over the 9, 12 or 16 unknowns, reweighted (soft L1 beyond two sigma). Each kind of datum counts by its own spread,
     found from the residuals over its own redundancy. ``start`` is a camera pose near by, as from the same observations
     and one more: it saves the search for one. Raises TooFewPoses below three and, without ``start``, what
     estimate_eye_on_base raises.
@@ -173,7 +173,7 @@ def _gauss_newton(
     sigma_n: float,
     sigma_r: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float]:
-    """The loop of from_motion.
+    """Return the loop of from_motion.
 
     Pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
 

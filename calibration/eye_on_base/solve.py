@@ -58,7 +58,7 @@ class SolveConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """Observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) normal seen; fit noise."""
+    """Hold observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) a normal; fit noise."""
 
     b: Array
     c: Array
@@ -87,10 +87,10 @@ class _Solution:
 def estimate_eye_on_base(
     observations: list[Observation] | tuple[Observation, ...], config: SolveConfig | None = None
 ) -> CalibrationEstimate:
-    """Estimate X_BC from observations of the flange at n poses; positions and (where seen) normals are used together.
+    """Estimate X_BC from observations of the flange at n poses, from positions and (if any) normals together.
 
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
-    of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
+    of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate. The variances of positions and
     of normals are estimated from the residuals (Helmert's simplified estimator, each group divided by its own
     redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn (of more than 100
     poses: without each of 100 groups). Deterministic for ``config.seed``. Raises TooFewPoses, RepeatedPoses,
@@ -107,15 +107,15 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to"
-            f" {100 * config.max_outliers:.0f} % outliers are excluded); check units, pose order and that the camera"
-            " did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (at most"
+            f" {100 * config.max_outliers:.0f} % may be outliers). Check the units and the order of the poses, and that"
+            " the camera did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
         raise InconsistentPoses(
-            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis; check units, pose order, the"
-            " quaternion order and that the camera did not move."
+            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis. Check the units, the order of the"
+            " poses and of the quaternion's numbers, and that the camera did not move."
         )
     if not inliers.all():
         check_diversity(
@@ -125,9 +125,9 @@ def estimate_eye_on_base(
     used = inliers & data.has
     if used.any() and float(np.median(tilt[used])) > _WORST_TILT_RAD:
         raise InconsistentPoses(
-            f"The faces seen are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from where the poses have"
-            " the flange's z axis: check the quaternion order (qw, qx, qy, qz) and that the poses are those of the"
-            " flange, not of a tool."
+            f"The scanned faces are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from the flange's z axis"
+            " in the poses. Check the quaternion order (qw, qx, qy, qz), and that the poses are those of the flange,"
+            " not of a tool."
         )
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
@@ -210,7 +210,7 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
 
 
 def _minimal_sets(n: int, hypotheses: int, seed: int) -> NDArray[np.int64]:
-    """All triples of n poses (k, 3), or as many drawn ones as there are hypotheses."""
+    """Return all triples of n poses (k, 3), or as many drawn ones as there are hypotheses."""
     if n * (n - 1) * (n - 2) // 6 <= hypotheses:
         return np.array(list(itertools.combinations(range(n), 3)))
     return drawn_triples(n, hypotheses, seed)
@@ -222,12 +222,12 @@ def _squares(data: _Data, R: Array, t: Array) -> Array:
 
 
 def _trimmed(square: Array, h: int) -> Array:
-    """The sum (k,) over the h smallest of each row of `square` (k, n)."""
+    """Return the sum (k,) over the h smallest of each row of `square` (k, n)."""
     return np.asarray(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1))
 
 
 def _distances(data: _Data, X: RigidTransform) -> Array:
-    """Of each centre seen from its stated place, (n,) m."""
+    """Return the distance of each observed centre from its stated position, (n,) m."""
     return np.asarray(np.linalg.norm(data.c @ X.rotation().matrix().T + X.translation() - data.b, axis=1))
 
 
@@ -296,7 +296,7 @@ def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
 
 
 def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0) -> _Solution:
-    """Weighted Gauss-Newton on the kept poses, variance components updated between steps."""
+    """Solve by weighted Gauss-Newton on the inliers, with variance components updated between steps."""
     d = data.pick(keep)
     rows = d.has
     R, p, N, N_p, redundancy_p, redundancy_n, var_p, var_n = _gauss_newton(
@@ -331,7 +331,7 @@ def _gauss_newton(
     var_n: float,
     usual: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float, float]:
-    """The loop of _fit.
+    """Return the loop of _fit.
 
     Pose, information of all and of the positions, redundancies and variance components of both kinds.
 
@@ -419,9 +419,9 @@ def _widened(solution: _Solution) -> Array:
 
     Its Gaussian 95 % region then holds the truth in 95 of 100 calibrations.
 
-    Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
-    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the
-    ratio of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
+    A plain inverse leaves out two things. The weights between positions and normals are estimates too (Kenward and
+    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself). So is the scale (the ratio
+    of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
     """
     inverse = np.linalg.pinv(solution.information)
     N_p = solution.information_p

@@ -34,13 +34,13 @@ def stated_median_limit(
 ) -> float | None:
     """Limit (mm) that the median error at these new observations (n) exceeds by chance in FALSE_ALARM of verifications.
 
-    The median of n errors has no closed form where all share the calibration's own error, so it is drawn: one error of
-    pose and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and
-    scanner and the noise of its fit. The spread was estimated from few residuals, so its square is drawn as well
-    (scaled inverse chi-square). A calibration with a local field states the spread (n,) m per axis that this leaves at
-    each scan: ``scatter_m``; one with errors of the arm what these contribute: ``shared``, derivatives (n, 3, p) of the
-    positions and the covariance (p, p) in place of the result's. A calibration states its held-out errors besides:
-    their 95 % percentile counts where it is larger. None where it states no error at all. Deterministic.
+    The median of n errors has no closed form where all share the calibration's own error, so it is simulated. One error
+    of pose and scanner correction is drawn from their joint covariance for all scans. For each scan the spread of robot
+    and scanner and the noise of its fit are drawn. The spread was estimated from few residuals, so its square is drawn
+    as well (scaled inverse chi-square). ``scatter_m`` (n,) m per axis: the spread that a local field leaves at each
+    scan. ``shared``: for errors of the arm, derivatives (n, 3, p) of the positions and the covariance (p, p) in place
+    of the result's. The 95 % percentile of the stated held-out errors counts where it is larger. None where the result
+    states no error at all. Deterministic.
     """
     stated = result.held_out_mm.get("p95")
     floor = float(stated) if stated is not None and np.isfinite(stated) else None
@@ -91,8 +91,10 @@ def joint_terms(
 def observed_document(
     observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
 ) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
-    joints where known."""
+    """Return the poses that a calibration used, for CalibrationResult.observed.
+
+    They are the feature in the base, the observed centre and normal, and the joints where they are known.
+    """
     X = X_FR or RigidTransform()
     return {
         "feature_xyz": [float(v) for v in X.translation()],
@@ -135,7 +137,7 @@ def feature_rotation(result: CalibrationResult) -> RotationMatrix:
 def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observation]) -> Array | None:
     """Spread (n,) m per axis of new scans, grown where the flange is turned beyond the orientations of the calibration.
 
-    What an arm leaves at one orientation says nothing of it at another: there its usual size is added, with the
+    The arm's error at one orientation says nothing about another orientation. There its usual size is added, with the
     covariance over angles that a local field has before any scan (0.15 mm per axis, 10 degrees). None where the result
     does not hold its orientations. Raises InputError where they cannot be read.
     """

@@ -37,10 +37,10 @@ _SINGULAR = 1e-6  # a choice between rounding (1e-15) and real motions, of colum
 class TcpOffset:
     """A TCP that the poses seem to carry.
 
-    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite
-    where these poses do not show it; ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the
-    residuals, may pretend at most; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability``
-    that chance alone does as much.
+    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z. ``sigma_m`` (3,), infinite
+    where these poses do not show it. ``pretended_m`` (3,) the largest offset that systematic errors of the arm,
+    or of the size of the residuals, could produce. ``with_m`` and ``without_m`` rms of the centres with and without it.
+    ``probability`` that chance alone does as much.
     """
 
     offset_m: Array
@@ -61,7 +61,7 @@ class TcpOffset:
         return float(np.linalg.norm(self.offset_m[self.known]))
 
     def surely_beyond(self, length_m: float) -> bool:
-        """Whether it is longer than that by four sigmas, and by what systematic errors may pretend."""
+        """Return whether it is longer than that by four sigmas, and by what systematic errors may pretend."""
         widest = np.maximum(_SURE_SIGMAS * self.sigma_m, self.pretended_m)[self.known]
         return self.length_m - float(np.linalg.norm(widest)) > length_m
 
@@ -92,7 +92,7 @@ class TcpOffset:
 
 
 def find_tcp(observations: Sequence[Observation], start: RigidTransform | None = None) -> TcpOffset | None:
-    """The TCP that observations (n >= 5) seem to carry; None where they show none, or cannot.
+    """Return the TCP that observations (n >= 5) seem to carry; None where they show none, or cannot.
 
     With the scanner's own errors left open, centres are fitted with and without a constant offset b in the frame of the
     poses, R_BC p_C + p_BC = p_BR + R_BR b. The F-test of both holds FALSE_ALARM for normal errors; besides, the offset
@@ -219,7 +219,7 @@ def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = Tru
 
 
 def _linear_start(data: _Data) -> RigidTransform | None:
-    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear.
+    """Return the camera's pose with the rotation's nine numbers free, so that an offset of any size is linear.
 
     None below six poses.
     """

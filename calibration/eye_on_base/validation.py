@@ -25,7 +25,7 @@ def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -
 
 
 def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
-    """Angle (n,) rad between seen and stated face normals; NaN where no normal was seen."""
+    """Return the angle (n,) rad between observed and stated face normals; NaN where none was observed."""
     out = []
     for o in observations:
         if o.n_C is None:
@@ -37,7 +37,7 @@ def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Ar
 
 
 def _plain(config: SolveConfig) -> Solve:
-    """The plain estimate, without a correction of the scanner, as a Solve."""
+    """Return the plain estimate, without a correction of the scanner, as a Solve."""
     config = replace(config, leave_one_out=False, hypotheses=150)
     return lambda observations: (estimate_eye_on_base(observations, config).X_BC, ScannerCorrection())
 
@@ -125,9 +125,9 @@ def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | N
 
     None for fewer than four errors.
 
-    From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the
-    coefficient of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees
-    of freedom).
+    It follows from the scatter of the held-out ``errors`` (n,) themselves. Both means have the relative error
+    c / sqrt(n), c the coefficient of variation. The logarithm of their ratio therefore has the variance 2 c^2 / n
+    (Student's t with n - 1 degrees of freedom).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]
@@ -145,9 +145,9 @@ def bootstrap_interval(
 
     None for fewer than four errors.
 
-    From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what
-    comes, and the ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani
-    1993, 13.3).
+    It follows from 4 000 pairs of resamples of the held-out ``errors`` (n,). One of a pair takes the place of the
+    reported errors, the other that of the new ones. The ratio of their quantiles is that of the new to the reported
+    quantile (bootstrap, Efron and Tibshirani 1993, 13.3).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]

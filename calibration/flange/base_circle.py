@@ -43,7 +43,7 @@ class BaseCircleConfig:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A plane seen through the pixels of a window (h, w, 3): heights (h, w) m over it, its axes, thickness."""
+    """Hold a plane under the pixels of a window (h, w, 3): heights (h, w) m over it, its axes, thickness."""
 
     plane: PlaneFit
     axes: Array
@@ -105,7 +105,7 @@ def _upward(window: Array, normal: Array) -> Mask:
 def _parallel_plane(
     points: Array, normal: Array, standard: FlangeStandard, config: BaseCircleConfig
 ) -> PlaneFit | None:
-    """The best supported plane of about the guessed normal."""
+    """Return the best supported plane of about the guessed normal."""
     if len(points) < config.min_points:
         return None
     for p, n, _ in local_planes(
@@ -132,7 +132,7 @@ def _look(window: Array, plane: PlaneFit) -> _View:
 def _arc(
     window: Array, view: _View, rays: RayModel, standard: FlangeStandard, config: BaseCircleConfig
 ) -> tuple[float, CircleFit] | None:
-    """The arc of the drawn radius in which a face ends, and the share of the circle that it covers."""
+    """Return the arc of the drawn radius in which a face ends, and the share of the circle that it covers."""
     with np.errstate(invalid="ignore"):
         face, below = np.abs(view.height) < view.thick, view.height < -_STEP_M
     u, v = _ends(face, below)
@@ -256,7 +256,7 @@ def _refine(
     rim = on_face & (circle.radius - rho < 1.5 * pitch)
     seen = coverage(xy[band][rim], circle.center)
     if seen < config.min_arc:
-        raise FlangeNotFound(f"Only {100 * seen:.0f} % of the base circle's edge was seen.")
+        raise FlangeNotFound(f"Only {100 * seen:.0f} % of the base circle's edge is in the scan.")
     axes, plane = view.axes, view.plane
     along = plane.rms**2 / plane.n_inliers + (plane.normal_sigma * float(np.linalg.norm(circle.center))) ** 2
     return FlangeFit(
@@ -274,7 +274,7 @@ def _refine(
 
 
 def _held(fit: CircleFit, radius_m: float, sigma_m: float) -> CircleFit:
-    """The circle with its radius held to the drawing by one more measurement of it."""
+    """Return the circle with its radius held to the drawing by one more measurement of it."""
     C = fit.covariance
     gain = C[:, 2] / (C[2, 2] + sigma_m**2)
     change = gain * (radius_m - fit.radius)

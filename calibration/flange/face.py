@@ -128,7 +128,7 @@ class FaceRefusal:
 
 @dataclass(frozen=True)
 class FlangeFace:
-    """A flange face with its plane, its edges, the share of the outer edge seen, and its quality.
+    """Hold a flange face with its plane, its edges, the visible share of the outer edge, and its quality.
 
     The edges' centres (2,) are in the plane's axes.
     """
@@ -213,7 +213,7 @@ def edge_bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig)
 def _first_circle(
     part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> CircleFit | None:
-    """The outer edge of a connected part (N, 2), roughly."""
+    """Return the outer edge of a connected part (N, 2), roughly."""
     bounds = edge_bounds(pitch, standard, config)
     extent = float(np.ptp(part, axis=0).max())
     wanted = f"the flange has {1e3 * standard.outer_m:.0f} mm"
@@ -334,7 +334,7 @@ def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
 
     Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough
+    sideways. Away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough
     face is thicker than the ``chamfer`` (m) is deep: it ends with it, and on the side that shows its wall one thickness
     below the plane (docs/flange.md).
     """
@@ -370,7 +370,7 @@ def _on_plane(points: Array, plane: PlaneFit, center: Array, reach: float) -> Ar
 
 
 def _parts(points: Array, plane: PlaneFit, center: Array, reach: float) -> tuple[Array, float, NDArray[np.intp]]:
-    """The face points (N, 2), the pitch between them (m), and the connected part each belongs to, largest 0."""
+    """Return the face points (N, 2), the pitch between them (m), and the connected part each belongs to, largest 0."""
     xy = _on_plane(points, plane, center, reach)
     if len(xy) < 6:
         return xy, 1e-3, np.zeros(len(xy), dtype=np.intp)
@@ -429,13 +429,13 @@ def judge(
 
 
 def _least_ring(m: FaceMeasurements) -> float:
-    """The share of the ring between the edges that must be face."""
+    """Return the share of the ring between the edges that must be face."""
     if m.bore is None:
         return _FULL
     return _SLOTTED if min(m.coverage, m.bore_coverage) > _ALL_ROUND else _HOLLOW
 
 
 def _concentric(outer: CircleFit, bore: CircleFit, pitch: float) -> bool:
-    """Whether two circles share their centre, within four sigmas and 0.3 of a pixel."""
+    """Return whether two circles share their centre, within four sigmas and 0.3 of a pixel."""
     spread = float(np.sqrt(np.trace(outer.covariance[:2, :2]) + np.trace(bore.covariance[:2, :2])))
     return float(np.hypot(*(outer.center - bore.center))) < 4.0 * spread + 0.3 * pitch

@@ -57,9 +57,9 @@ class FlangeGuess:
 class FlangeFit:
     """A flange found in a cloud, camera frame C, metres.
 
-    ``center_C`` (3,) centre of the concentric edges in the face plane; ``normal_C`` (3,) outward, towards the scanner;
+    ``center_C`` (3,) centre of the concentric edges in the face plane. ``normal_C`` (3,) outward, towards the scanner.
     ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad (per axis) cover the noise of this scan, not the scanner's
-    systematic error; ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen);
+    systematic error. ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen).
     ``coverage`` is the share 0..1 of the outer edge that was seen, ``on_grid``
     whether it was measured on a pixel grid. ``plane_rms_m``, ``outer_rms_m`` and ``bore_rms_m`` are
     the residuals of each feature, ``rim_rms_m`` of both edges together.
@@ -91,7 +91,7 @@ def fit_flange(
 
     The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one
     decides. Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a
-    search of the guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
+    search of the guess's surroundings. Without a guess a search of the whole scan. Unordered clouds: the same on the
     sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the
     flange's size.
 
@@ -119,7 +119,7 @@ def fit_flange(
 def _unordered(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A list of points.
+    """Return a list of points.
 
     On its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then searched.
     """
@@ -146,7 +146,7 @@ def _unordered(
 def _organised(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A scan with its pixel grid: the whole of it, or the window about a guess."""
+    """Return a scan with its pixel grid: the whole of it, or the window about a guess."""
     measured = None
     if is_thinned(cloud):
         measured = np.isfinite(cloud[..., 2])
@@ -200,7 +200,7 @@ def _where_it_was(
 
 
 def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal) -> FlangeFit | None:
-    """A cloud that shows little more than a flange as it is; a larger scene body by body."""
+    """Return a cloud that shows little more than a flange as it is; a larger scene body by body."""
     if len(points) == 0:
         refusal.note(0, "The cloud holds no valid point.")
         return None
@@ -381,13 +381,13 @@ def _basis(ray: Array, middle: Array) -> Array | None:
 
 
 def _same(d: Array, like: Array) -> Array:
-    """The median of those steps (N, 2) that equal one of them, or its reverse, within a fifth of its length."""
+    """Return the median of those steps (N, 2) that equal one of them, or its reverse, within a fifth of its length."""
     d = np.where((d @ like)[:, None] < 0.0, -d, d)
     return np.asarray(np.median(d[np.hypot(*(d - like).T) < 0.2 * np.hypot(*like)], axis=0))
 
 
 def _reduced(basis: Array) -> Array:
-    """The shortest basis of the same lattice (Lagrange)."""
+    """Return the shortest basis of the same lattice (Lagrange)."""
     a, b = basis
     for _ in range(10):
         if a @ a > b @ b:
@@ -444,7 +444,7 @@ def is_thinned(grid: Array) -> bool:
 
 
 def interpolated(grid: Array) -> Array:
-    """A thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
+    """Return a thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
 
     x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one goes on.
     Gaps longer than twice the common one stay.
@@ -484,7 +484,7 @@ def _along_rows(rays: Array) -> Array:
 
 
 def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
-    """The points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
+    """Return the points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
     flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
     # most of a cloud is far from the face's plane; NaN is nowhere near
     flat = flat[np.abs((flat - fit.center_C) @ fit.normal_C) < 2.0 * standard.chamfer_m + 0.002]

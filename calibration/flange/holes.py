@@ -34,7 +34,7 @@ class HolePattern:
 
     ``rms_m`` is the root mean square of how far the holes lie from their places in the pattern.
     ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation
-    then translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
+    then translation, in the camera's axes. Both cover this scan's noise and how well the holes agree.
     ``other_turns_rad`` are rotations about the axis, from that of X_CR, under which the scan shows the pattern as well
     (the threads alone are symmetric; the dowel hole decides): the spread then covers all of them, and ``turn_known`` is
     false.
@@ -56,7 +56,7 @@ class HolePattern:
 
 
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
-    """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are seen well.
+    """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are clear.
 
     ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face and
     have rims: slots are as empty as holes. Each hole's rim is a circle, with one radius for all threads in the end, and
@@ -219,7 +219,7 @@ def _other_turns(
 
 
 def _about(xy: Array, expected: NDArray[np.complex128], nominal: Array) -> list[Array]:
-    """The face points (2, N_k) m about each expected hole."""
+    """Return the face points (2, N_k) m about each expected hole."""
     out = []
     for c, r in zip(expected, nominal, strict=True):
         x, y = xy[0] - c.real, xy[1] - c.imag

@@ -48,7 +48,7 @@ def search_frame(
     refusal: FaceRefusal,
     measured: NDArray[np.bool_] | None = None,
 ) -> FlangeFace | None:
-    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted.
+    """Return the best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted.
 
     Of a thinned scan, whose missing pixels are interpolated, ``measured`` (H, W) says which were not.
     """
@@ -221,7 +221,7 @@ def _likeliest(
 
 
 def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[FlatPart]:
-    """The part as it is, or the planes it consists of where it leaked over a shallow step onto another."""
+    """Return the part as it is, or the planes it consists of where it leaked over a shallow step onto another."""
     extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
     if not 0.55 * standard.outer_m < extent < _WIDEST * standard.outer_m:
         return []
@@ -277,7 +277,7 @@ def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> t
 
 
 def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float, float] | None:
-    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m).
+    """Return a circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m).
 
     Centre, radius, misfit (m).
     """

@@ -74,7 +74,7 @@ def fit_tracked(
 def _plane(
     z: Single, rays: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
 ) -> PlaneFit | None:
-    """The plane of the pixels that lie on the expected ring, from some thousands of them."""
+    """Return the plane of the pixels that lie on the expected ring, from some thousands of them."""
     ring = np.pi * (standard.face_outer_radius_m**2 - standard.face_inner_radius_m**2)
     pitch2 = abs(rays[1, 0] * rays[2, 1] - rays[1, 1] * rays[2, 0]) * float(center[2]) ** 2
     step = max(1, int(np.sqrt(ring / pitch2 / _PLANE_POINTS) + 0.3))
@@ -145,7 +145,7 @@ class _View:
         return np.asarray((xy + (at[:, None] if xy.ndim == 2 else at)) * (1.0 / float(self.at[2])))
 
     def onto(self, center: Array) -> Array:
-        """A point's place (2,) m along its ray on the plane."""
+        """Return a point's place (2,) m along its ray on the plane."""
         c = center @ self.axes
         return np.asarray(c[:2] * (self.at[2] / c[2]) - self.at[:2])
 
@@ -167,7 +167,7 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
     for r, way in zip(radii, (inward, ~inward), strict=True):
         at = np.flatnonzero((np.abs(rho - r) < width) & way)
         if len(at) < 48:
-            raise CircleFitError("Too little of an edge was seen.")
+            raise CircleFitError("Too little of an edge is in the scan.")
         rims.append(d[:, at[:: -(-len(at) // _EDGE_POINTS)]].T)
     rough = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.05 * pitch)
     if (

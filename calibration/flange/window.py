@@ -211,7 +211,7 @@ def _edges(
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
         if len(rims[0]) < 24:
-            raise CircleFitError(f"Too little of an edge {1e3 * standard.outer_m:.0f} mm across was seen.")
+            raise CircleFitError(f"Too little of an edge {1e3 * standard.outer_m:.0f} mm across is in the scan.")
         seen = 1 + (len(rims[1]) >= 24)
         fits = refine_circles(rims[:seen], radii[:seen], noise_floor=0.1 * pitch)
         if not float(np.hypot(*fits[0].center)) < 3.0 * widths[0] or not 0.5 * radius < fits[0].radius < 2.0 * radius:
@@ -236,7 +236,7 @@ def _edges(
 
 
 def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
-    """The one of ``sectors`` (N,) in which each direction lies."""
+    """Return the one of ``sectors`` (N,) in which each direction lies."""
     return ((np.arctan2(dy, dx) + np.pi) * (sectors / (2.0 * np.pi))).astype(np.intp) % sectors
 
 
@@ -289,7 +289,7 @@ def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, 
 def _labelled(
     w: _Window, axes: Array, start: CircleFit, hidden: Mask, pitch: float, lowered: float, clear: float, *, outer: bool
 ) -> CircleFit:
-    """The edge from the pixels on either side of it. Raises CircleFitError where they do not fix it."""
+    """Return the edge from the pixels on either side of it. Raises CircleFitError where they do not fix it."""
     x, y = w.x, w.y
     rho2 = (x - start.center[0]) ** 2 + (y - start.center[1]) ** 2
     reach = min(clear, _LABELLED * pitch + 3.0 * float(np.sqrt(np.trace(start.covariance[:2, :2]))))
@@ -339,7 +339,7 @@ def _face(
     grid: Array,
     axes: Array,
 ) -> FlangeFace | None:
-    """The tests, then the plane once more, of all that proved to be the face."""
+    """Return the tests, then the plane once more, of all that proved to be the face."""
     low, high = standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch
     ring = (rho2 > low**2) & (rho2 < high**2)
     core = rho2 < (0.7 * standard.bore_radius_m) ** 2
@@ -414,13 +414,13 @@ def _domed(w: _Window, ring: Mask, rho2: Array, plane: PlaneFit) -> bool:
 
 
 def _thin(ring: Mask) -> tuple[slice, slice]:
-    """Every k-th pixel along rows and columns, so that some thousands of the ring remain."""
+    """Return every k-th pixel along rows and columns, so that some thousands of the ring remain."""
     step = slice(None, None, max(1, int(np.sqrt(np.count_nonzero(ring) / _PLANE_POINTS) + 0.5)))
     return step, step
 
 
 def _honest(plane: PlaneFit, w: _Window, ring: Mask) -> PlaneFit:
-    """The plane with the spread that is left when neighbouring pixels share their noise: as some of them tell it."""
+    """Return the plane with its spread when neighbouring pixels share their noise, from a sample of pixels."""
     s = _thin(ring)
     n = plane.normal
     at = np.flatnonzero(ring[s])
@@ -435,7 +435,7 @@ def _honest(plane: PlaneFit, w: _Window, ring: Mask) -> PlaneFit:
 
 
 def _moved(center: Array, old: PlaneFit, new: PlaneFit, axes: Array) -> Array:
-    """A centre (2,) on one plane, along its ray onto another, in that one's axes."""
+    """Return a centre (2,) on one plane, along its ray onto another, in that one's axes."""
     p = old.point + axes @ center
     p = p * (float(new.normal @ new.point) / float(new.normal @ p))
     return np.asarray((p - new.point) @ np.column_stack(plane_axes(new.normal)))

@@ -57,7 +57,7 @@ def log_rotation(R: Array) -> Array:
 
 
 def as_transform(X: Array) -> RigidTransform:
-    """A pose (4, 4) as RigidTransform, its rotation projected."""
+    """Return a pose (4, 4) as RigidTransform, its rotation projected."""
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
@@ -127,7 +127,7 @@ def moved(X: Array, change: Array) -> Array:
 
 
 def difference(X: Array, Y: Array) -> Array:
-    """The change (6,) that moves X to Y in the sense of ``moved``."""
+    """Return the change (6,) that moves X to Y in the sense of ``moved``."""
     return np.concatenate([log_rotation((Y[:3, :3] @ X[:3, :3].T)[None])[0], Y[:3, 3] - X[:3, 3]])
 
 
@@ -142,7 +142,7 @@ def random_rotations(n: int, rng: np.random.Generator) -> Array:
 
 
 def mean_of(poses: list[Array]) -> Array:
-    """The pose M with sum log(M^-1 X_k) = 0 on SE(3).
+    """Return the pose M with sum log(M^-1 X_k) = 0 on SE(3).
 
     It moves with the poses under any change of frames on either side (Pennec and Arsigny 2013, bi-invariant mean).
     """

@@ -142,9 +142,9 @@ def fit(
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
     Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre
-    is an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
-    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so
-    the answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
+    is an unknown like the others (starting at ``centre``, else at the target's origin). It is the point of the target
+    whose displacement is least, since a camera errs about the middle of a board and not about its origin. The answer
+    thus moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
     see Scaled. ``keep`` (n,): observations that count; the others get residuals only. ``begin``: the derivatives at the
     start, where known. ``tolerance``: of what is left, in standard deviations.
     """
@@ -277,7 +277,7 @@ def solve(
 
 
 def _concentrated(problem: Problem, state: State) -> State:
-    """The state of the poses that agree best, where some may be outliers.
+    """Return the state of the poses that agree best, where some may be outliers.
 
     Few outliers of few poses hide in the noise that they cause.
 
@@ -360,7 +360,7 @@ def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...])
 
 
 def most_promising(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
-    """The start with the least cost after a descent from the most promising ones."""
+    """Return the start with the least cost after a descent from the most promising ones."""
     if not pool:
         return None, np.inf, ""
     length = problem.extent

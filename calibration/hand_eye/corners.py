@@ -69,7 +69,7 @@ def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -
     """Estimate the shift of the principal point together with the poses and apply it only if the data allow.
 
     A principal point that is off turns every board about the camera: hand-eye motion shows it, reprojection does not.
-    The shift maximises the likelihood of the hand-eye residuals; it is applied if it is no chance (likelihood ratio, 1
+    The shift maximises the likelihood of the hand-eye residuals. It is applied if it is no chance (likelihood ratio, 1
     %), if it lies within a tenth of the image, and if the held-out errors fall. Its uncertainty then goes into the
     covariance. Raises as poses_from_corners and solve_problem.
     """
@@ -148,7 +148,7 @@ def _sigma(deviance: Callable[[Array], float], shift: Array, least: float) -> Ar
 def _with_shift_uncertainty(
     result: HandEyeResult, solved: Callable[[Array], HandEyeResult], shift: Array, sigma: Array
 ) -> HandEyeResult:
-    """The covariance of the poses with what they change when the principal point does."""
+    """Return the covariance of the poses with what they change when the principal point does."""
     joint = result.joint_covariance.copy()
     for k in range(2):
         e = _STEP_PX * np.eye(2)[k]

@@ -160,8 +160,8 @@ def determinacy(
     """Name the directions that the observations leave open.
 
     ``information`` and ``covariance`` (m, m) of the unknowns; ``length``: extent of the data; ``noise_rad``: per axis.
-    A direction is open where the information vanishes, where its predicted standard deviation exceeds a tenth of a
-    radian or of the extent, or (one rotation axis) where the turns off that axis drown in the rotation noise.
+    A direction is unobservable in three cases. Its information vanishes. Its predicted standard deviation exceeds a
+    tenth of a radian or of the extent. Or, with one rotation axis, the turns off that axis drown in the rotation noise.
     """
     scale = np.tile([1.0, 1.0, 1.0, length, length, length], problem.size // 6)
     N = information * scale[:, None] * scale
@@ -207,7 +207,7 @@ def with_open_directions(covariance: Array, found: Determinacy, length: float) -
 
 
 def without_drift(problem: Problem, state: State, found: Determinacy) -> State:
-    """The solution with the shortest positions along directions that carry no information."""
+    """Return the solution with the shortest positions along directions that carry no information."""
     for v in found.directions:
         blocks = v.reshape(-1, 6)
         if float(np.abs(blocks[:, :3]).max()) > 1e-6 * float(np.abs(blocks[:, 3:]).max()):

@@ -25,7 +25,7 @@ class Provenance:
 
 
 def export_drake_directive(X: RigidTransform, parent: str, child: str) -> str:
-    """A Drake model directive that adds the child frame to the parent."""
+    """Return a Drake model directive that adds the child frame to the parent."""
     roll, pitch, yaw = np.degrees(X.rotation().ToRollPitchYaw().vector())
     x, y, z = X.translation()
     return (
@@ -36,7 +36,7 @@ def export_drake_directive(X: RigidTransform, parent: str, child: str) -> str:
 
 
 def document(result: HandEyeResult, mounting: Mounting, provenance: Provenance) -> dict[str, object]:
-    """All of a result in plain types: what hand_eye.yaml holds."""
+    """Return all of a result in plain types: what hand_eye.yaml holds."""
     held, correction = result.held_out, getattr(result, "correction", None)
     return {
         "schema": 1,

@@ -87,7 +87,7 @@ class _Robot:
     camera: Array
 
     def problem(self, u: Array) -> Problem:
-        """The equation of one robot's poses with these errors."""
+        """Return the equation of one robot's poses with these errors."""
         errors = np.zeros(6 * self.arm.n)
         errors[self.which] = u * self.scale
         moved = self._undone @ flange_poses(self.arm, self.q, errors.reshape(-1, 6)) @ self.tool
@@ -100,7 +100,7 @@ class _Robot:
         return np.asarray(self.stated @ inverse(self.tool) @ inverse(as_is))
 
     def pick(self, rows: NDArray[np.bool_]) -> _Robot:
-        """The same robot at some of its poses."""
+        """Return the same robot at some of its poses."""
         return replace(self, stated=self.stated[rows], q=self.q[rows], camera=self.camera[rows])
 
 
@@ -126,10 +126,10 @@ def refine_joints(
 
     ``kind`` is "joints" or "links", which are six numbers a joint.
 
-    Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as
-    a whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and
-    along its axis). Applied only if held-out errors fall, in a paired test on five folds, and not one column at the
-    cost of the other; otherwise the sentence says that it does not help. ``plain`` is the result of the poses as given.
+    Maximum a posteriori: the prior holds what the poses do not show at zero. A change that only moves the base or the
+    flange as a whole is no error of the robot and is omitted. That is all of the first joint, and turn and shift of the
+    last one about and along its axis. The errors are applied only if both held-out errors fall, in a paired test on
+    five folds. Otherwise the sentence says that they do not help. ``plain`` is the result of the poses as given.
     Raises DatasetError without joint angles, InputError where they do not belong to the arm or the mounting.
     """
     prior, config = prior or JointPrior(), config or HandEyeConfig()
@@ -190,7 +190,7 @@ def refine_joints(
 
 
 def poses_of_arm(pairs: PosePairs, arm: Chain) -> PosePairs:
-    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles.
+    """Return the pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles.
 
     A constant tool stays.
 

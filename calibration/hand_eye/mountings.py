@@ -118,8 +118,8 @@ MOUNTINGS: dict[str, Mounting] = {
 class TargetObservation:
     """One observation of the target.
 
-    ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that carries the
-    camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
+    ``X_BF``: flange in base (of the robot with the camera where there are two). ``X_BL``: the link that carries the
+    camera (eye_on_arm only). ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
     Measured: ``p_CM`` (3,) always, with ``n_CM`` (3,) the unit z axis of the target (its normal) or ``R_CM`` all of its
     rotation where known. ``covariance`` (6, 6) [rotation; translation] of the measurement in the target's axes, None
@@ -136,7 +136,7 @@ class TargetObservation:
 
 
 def get_mounting(name: str) -> Mounting:
-    """A mounting by name; InputError naming the known ones."""
+    """Return a mounting by name; InputError naming the known ones."""
     if name not in MOUNTINGS:
         raise InputError(f"There is no mounting '{name}'; choose one of {', '.join(MOUNTINGS)}.")
     return MOUNTINGS[name]
@@ -162,7 +162,7 @@ def chain(mounting: Mounting, X_BF: Array, X_BL: Array | None = None, X_DE: Arra
 def problem_of(
     mounting: Mounting, observations: Sequence[TargetObservation], known: dict[str, RigidTransform]
 ) -> Problem:
-    """The equation of these observations.
+    """Return the equation of these observations.
 
     ``known``: letters of unknowns that are given (a flange as target: Y or Z).
     """

@@ -79,7 +79,7 @@ class Problem:
         return (0,) if self.tied else tuple(k for k in range(3) if self.free[k])
 
     def pick(self, rows: Flags | NDArray[np.int64]) -> Problem:
-        """The same equation with some of the observations."""
+        """Return the same equation with some of the observations."""
         return replace(
             self,
             F=self.F[rows],
@@ -91,7 +91,7 @@ class Problem:
         )
 
     def step(self, state: State, change: Array) -> State:
-        """The poses after a change (6 per free pose)."""
+        """Return the poses after a change (6 per free pose)."""
         out = list(state)
         for row, k in enumerate(self.blocks):
             out[k] = moved(state[k], change[6 * row : 6 * row + 6])
@@ -141,7 +141,7 @@ def linearise(problem: Problem, state: State, centre: Array) -> Linearised:
     """Residuals and analytic derivatives; ``centre`` (3,) in T is the point whose displacement a full pose reports.
 
     Derivation: with M = F X G, L = Y H Z, D = L^-1 M, a change (a, b) of X turns D by R_L^T R_F a and moves the point
-    by R_L^T R_F (a x R_X g + b); a change of Y or Z does so with the opposite sign and its own lever arm.
+    by R_L^T R_F (a x R_X g + b). A change of Y or Z does so with the opposite sign and its own lever arm.
     """
     w, d, point, RL, g, turn = _evaluate(problem, state, centre)
     X, Y, Z = state
@@ -218,7 +218,7 @@ def full_problem(
     tied: bool = False,
     covariance: Array | None = None,
 ) -> Problem:
-    """A problem whose observations are all full poses."""
+    """Return a problem whose observations are all full poses."""
     n = len(F)
     H = np.broadcast_to(IDENTITY, (n, 4, 4)) if H is None else H
     return Problem(
@@ -376,7 +376,7 @@ class Scaled:
         return e, self.root @ np.concatenate([lin.Jw, lin.Jd], axis=1)
 
     def variances(self, lin: Linearised, noise: Noise, floor: float) -> Noise:
-        """The variances that make each group's weighted squares equal to its redundancy.
+        """Return the variances that make each group's weighted squares equal to its redundancy.
 
         One Newton step in the log.
         """

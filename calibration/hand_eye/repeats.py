@@ -64,7 +64,7 @@ def one_per_pose(problem: Problem, known: State = (IDENTITY, IDENTITY, IDENTITY)
 
 
 def _noise(problem: Problem, known: State) -> _Noise:
-    """The noise of one sample of each pose; infinite where no solution is found."""
+    """Return the noise of one sample of each pose; infinite where no solution is found."""
     try:
         found = solve(problem, known, usual_discord=0.0).fit
     except WeldcalError:
@@ -104,7 +104,7 @@ def _places(problem: Problem) -> NDArray[np.int64]:
 def _without_gross(
     problem: Problem, place: NDArray[np.int64], noise: _Noise
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The numbers (n,) of the observations, and whether each sample agrees with its like.
+    """Return the numbers (n,) of the observations, and whether each sample agrees with its like.
 
     Of three repeats or more, one that disagrees grossly with the others is wrong. Of two, nobody knows which: each is
     an observation.
@@ -127,7 +127,7 @@ def _without_gross(
 
 
 def _most_central(G: Array, extent: float) -> int:
-    """The pose with the least median distance to the others; of many, one of an even choice."""
+    """Return the pose with the least median distance to the others; of many, one of an even choice."""
     some = np.unique(np.linspace(0, len(G) - 1, min(len(G), 30)).round().astype(int))
     cost = []
     for k in some:

@@ -34,9 +34,9 @@ _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decim
 class HandEyeConfig:
     """Settings.
 
-    ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive; ``allow_open``: give
-    an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot pose
-    are one observation; ``usual_discord_rad``: angle by which rotations and positions of the camera disagree
+    ``folds``: of the held-out errors (0: none). ``max_outliers``: share of gross ones to survive. ``allow_open``: give
+    an answer even where more than one direction of translation stays open. ``join_repeats``: samples at one robot pose
+    are one observation. ``usual_discord_rad``: angle by which rotations and positions of the camera disagree
     beforehand.
     """
 
@@ -77,7 +77,7 @@ class HandEyeResult:
 
     ``poses``: X, Y, Z as far as they were unknown. ``covariance`` (6, 6) each, [rotation; translation]: X = (exp(a) R,
     p + b), a (rad) a rotation on the parent's side about the child's origin, b the displacement of that origin, both in
-    the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
+    the parent's axes. Open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
     ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target
@@ -157,7 +157,7 @@ def solve_ax_yb(
     covariance: ArrayLike | None = None,
     labels: dict[str, str] | None = None,
 ) -> HandEyeResult:
-    """A_i X = Y B_i for poses (n, 4, 4); B_i is what was measured, and residuals are seen in the child frame of B.
+    """Solve A_i X = Y B_i for poses (n, 4, 4); B_i is measured, and residuals are in the child frame of B.
 
     With the paper's Eq. (4): A = X_BF, B = X_CM, X = X_FM, Y = X_BC. ``covariance`` (n, 6, 6) of B in its child's
     tangent, beyond which the noise is estimated. Raises as solve_problem.
@@ -332,7 +332,7 @@ def _held_out(
 
 
 def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
-    """A stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome.
+    """Return a stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome.
 
     Raises InputError naming the first bad one.
     """

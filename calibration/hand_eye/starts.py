@@ -182,7 +182,7 @@ def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
 
 
 def grid(problem: Problem, state: State, rng: np.random.Generator, n: int = 24) -> list[tuple[str, State]]:
-    """Turns of the cube, seen from a random side, for X.
+    """Return the rotations of the cube, about a random axis, as starts for X.
 
     The rotations of the other unknowns follow from the observations where these are poses, or stay as they are.
     """

@@ -152,13 +152,13 @@ def new_variances(
 class ClockFit:
     """Result of the joint fit of N frames.
 
-    ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the edges
-    found over the face's noise; ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then
-    translation on the base side about ``pivot``); ``information`` (K, K) of those; ``keep`` (N,) frames used; ``late``
-    (N,) frames whose time was left free; ``capture`` (N,) s most probable capture times and ``nominal`` (N,) s;
-    ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of the normals; ``rates`` (N, 3)
-    m/s of the centre; ``jitters`` (N,) s as each frame alone tells it, and their variances ``jitter_variance`` (N,)
-    s^2; ``weighted`` (N, K) scores. ``X_FR``: the feature on what moves; where TARGET is free, X_BT as estimated.
+    ``X_BC``. ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the edges
+    found over the face's noise. ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then
+    translation on the base side about ``pivot``). ``information`` (K, K) of those. ``keep`` (N,) frames used. ``late``
+    (N,) frames whose time was left free. ``capture`` (N,) s most probable capture times and ``nominal`` (N,) s.
+    ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of the normals. ``rates`` (N, 3)
+    m/s of the centre. ``jitters`` (N,) s as each frame alone tells it, and their variances ``jitter_variance`` (N,)
+    s^2. ``weighted`` (N, K) scores. ``X_FR``: the feature on what moves; where TARGET is free, X_BT as estimated.
     """
 
     X_BC: RigidTransform
@@ -401,7 +401,7 @@ def _polished_capture(
 def linearised(
     problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
 ) -> LinearisedStream:
-    """The model at capture times (N,) s.
+    """Return the model at capture times (N,) s.
 
     Residuals extrapolated to the nominal times, and their derivatives by all unknowns. ``rolling`` s, ``edge`` in
     noises of the face, rotations about ``pivot`` (3,) m.

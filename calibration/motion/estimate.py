@@ -31,8 +31,8 @@ _MOST = 900  # frames whose pairs are looked at
 class PlaceErrors:
     """Errors that depend on the place.
 
-    ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal, correlated over ``length_m``; ``found``
-    whether they are significant; ``meat`` (K, K): covariance of the fit's scores that they add.
+    ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal, correlated over ``length_m``. ``found``
+    whether they are significant. ``meat`` (K, K): covariance of the fit's scores that they add.
     """
 
     found: bool
@@ -160,9 +160,9 @@ class MotionEstimate:
 
     ``covariance`` (6, 6) of X_BC as in CalibrationResult; ``joint`` (6 + K, 6 + K) with the clock's unknowns behind it,
     offset (s), drift, rolling (s) as far as ``names`` lists them. ``clock`` what was found of it. ``inliers`` (N,)
-    frames used; ``capture`` (N,) s their most probable capture times on the robot's clock; ``residual_m`` (N,) distance
+    frames used. ``capture`` (N,) s their most probable capture times on the robot's clock. ``residual_m`` (N,) distance
     of the centres there, ``along_m`` (N,) along the motion at the time that the clock says, ``before_m`` (N,) the same
-    if arrivals are taken for captures (X_BC fitted so), ``tilt_rad`` (N,); ``held_out_m``,
+    if arrivals are taken for captures (X_BC fitted so), ``tilt_rad`` (N,). ``held_out_m``,
     ``held_out_tilt_rad`` (N,) from fits without the frame's own block of time. ``speed`` (N,) m/s.
     """
 
@@ -203,7 +203,7 @@ def estimate_in_motion(
     """X_BC and the scanner's clock from frames in motion.
 
     With an inverted ``motion``, of a scanner on the flange that sees a fixed target, X_FC takes the place of X_BC, and
-    the target's pose, found with it, is ``fit.X_FR``; ``X_FR`` is then not used.
+    the target's pose, found with it, is ``fit.X_FR``. ``X_FR`` is then not used.
 
     The device's clock is used where it runs evenly, else the arrivals. The clock's drift is estimated for a device, a
     rolling time within the frame where it is significant. Without motion that shows the offset, X_BC comes from the
@@ -328,7 +328,7 @@ def _fitted(
 
 
 def _target(motion: ContinuousMotion) -> tuple[int, ...]:
-    """The unknowns of a fixed target, where one is seen."""
+    """Hold the unknowns of a fixed target, where there is one."""
     return TARGET if motion.inverted else ()
 
 

@@ -108,7 +108,7 @@ def recorded_stream(
 
 @dataclass(frozen=True)
 class PredictedSigma:
-    """What a motion is expected to tell, one sigma.
+    """Hold the accuracy that a motion is expected to give, one sigma.
 
     ``work_m`` of a point among the flange's places (3-D), ``turn_rad`` of X_BC's rotation (3-D), ``offset_s`` of the
     clock, ``shared`` the largest correlation 0..1 of the offset with a shift of the scanner. Infinite where the motion

@@ -53,7 +53,7 @@ class FittedFrames:
 
 
 def observed_frames(frames: list[FrameTime], fits: dict[str, FlangeFit]) -> ObservedFrames:
-    """Times and fits of frames as arrays; a rough face seen at a slant counts less along the slant."""
+    """Return times and fits of frames as arrays; a rough face at a slant has less weight along the slant."""
     device = np.array([np.nan if f.device is None else f.device for f in frames])
     found = [fits[f.id] for f in frames]
     return ObservedFrames(
@@ -97,7 +97,7 @@ def see_frames(
     """Fit the flange in every frame.
 
     Some frames, spread over the recording, are searched whole. They give a first X_BC and delay, and with them the
-    robot's stream says where the flange is in each other frame; where it is not there, the whole frame is searched.
+    robot's stream says where the flange is in each other frame. Where it is not there, the whole frame is searched.
     ``X_BC``: pose to begin with. An inverted ``motion`` is that of a fixed target before a scanner on the flange.
     Deterministic for ``seed``. Raises TooFewPoses where too few frames show the flange to begin.
     """

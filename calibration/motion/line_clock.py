@@ -122,7 +122,7 @@ def offset_sigma(
 
 
 def _line(q: Array) -> tuple[Array, Array]:
-    """A point (3,) and the direction (3,) of the line through points (n, 3)."""
+    """Return a point (3,) and the direction (3,) of the line through points (n, 3)."""
     middle = np.median(q, axis=0)
     return middle, np.linalg.svd(q - middle, full_matrices=False)[2][0]
 

@@ -17,8 +17,8 @@ _MOST_DRIFT = 1e-2  # a choice: a hundred times what crystals are off (100 ppm);
 class ObservedFrames:
     """N frames in the order of their arrival.
 
-    ``arrival`` (N,) s on the robot's clock; ``device`` (N,) s on the scanner's own clock, NaN where a frame has none,
-    or None; ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame; ``covariance`` (N, 3,
+    ``arrival`` (N,) s on the robot's clock. ``device`` (N,) s on the scanner's own clock, NaN where a frame has none,
+    or None. ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame. ``covariance`` (N, 3,
     3) m^2 of the centre, ``normal_sigma`` (N,) rad an axis. ``slide`` (N, 3) m in the camera frame, or None: how a
     centre moves if the edges found lie one noise of the face below it (a rough face hides where its chamfer begins).
     """
@@ -71,12 +71,12 @@ class FrameClock:
 
 
 def arrival_clock(frames: ObservedFrames, reason: str = "The frames have no device times.") -> FrameClock:
-    """The frames ordered by their arrivals."""
+    """Return the frames ordered by their arrivals."""
     return FrameClock(ARRIVAL, frames.arrival, -1.0, 0.0, float(np.median(frames.arrival)), reason)
 
 
 def choose_clock(frames: ObservedFrames) -> FrameClock:
-    """The device's clock where it runs evenly beside the arrivals; else the arrivals, with the reason."""
+    """Return the device's clock where it runs evenly beside the arrivals; else the arrivals, with the reason."""
     if frames.device is None or not np.isfinite(frames.device).any():
         return arrival_clock(frames)
     has = np.isfinite(frames.device)

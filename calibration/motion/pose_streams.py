@@ -34,7 +34,7 @@ from weldcal.models.errors import InputError, WeldcalError
 
 
 def is_stream_file(path: Path) -> bool:
-    """Whether a file is an npz with the arrays `hand` and `eye`."""
+    """Return whether a file is an npz with the arrays `hand` and `eye`."""
     if path.suffix.lower() != ".npz" or not path.is_file():
         return False
     try:
@@ -127,7 +127,7 @@ def read_streams(path: Path) -> PoseStreams:
 
 
 def are_trajectories(robot: Listing, camera: Listing) -> bool:
-    """Whether two lists of poses with times are recordings in motion, of different lengths.
+    """Return whether two lists of poses with times are recordings in motion, of different lengths.
 
     They pair by interpolation.
     """
@@ -159,8 +159,8 @@ def synchronise_lists(
     if len(a) * len(b) > _MOST_READINGS:
         who = "robot" if len(a) >= len(b) else "camera"
         raise DatasetError(
-            f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))}"
-            f" ways. State how they are written, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
+            f"The rotations of '{(robot if who == 'robot' else camera).name}' fit {max(len(a), len(b))}"
+            f" conventions. Name the right one, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
         )
     tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None
@@ -298,7 +298,7 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
 
 
 def _correlated(streams: PoseStreams, hand: ContinuousMotion) -> float:
-    """The offset (s) at which the angular speeds of both agree best."""
+    """Return the offset (s) at which the angular speeds of both agree best."""
     eye = ContinuousMotion(RobotStream(streams.eye_time, streams.eye))
     begin = max(hand.span[0], eye.span[0] - _WIDEST_S) + _RATE_S
     end = min(hand.span[1], eye.span[1] + _WIDEST_S) - _RATE_S

@@ -81,7 +81,7 @@ def search_start(
 
 
 def plausible(delays: Array, cost: Array) -> float:
-    """The delay of least cost; where a motion repeats itself, of those about as good the one nearest to zero."""
+    """Return the delay of least cost; where a motion repeats itself, of those about as good the one nearest to zero."""
     c = np.where(np.isfinite(cost), cost, np.inf)
     around = np.minimum(np.concatenate([[np.inf], c[:-1]]), np.concatenate([c[1:], [np.inf]]))
     good = np.flatnonzero((c <= around) & (c <= _ALIAS**2 * c.min() + _SAME_M**2))
@@ -217,7 +217,7 @@ def _at(
 
 
 def _relaxed(R_B: Array, p_B: Array, p_C: Array, n_C: Array) -> Array:
-    """The rotation nearest to the nine elements that solve the linear equations."""
+    """Return the rotation nearest to the nine elements that solve the linear equations."""
     n = len(p_C)
     A = np.zeros((n, 6, 18))
     A[:, :3, :9] = (R_B[:, :, :, None] * p_C[:, None, None, :]).reshape(n, 3, 9)

@@ -47,7 +47,7 @@ class FeatureMotion:
 class ContinuousMotion:
     """Flange pose X_BF as a function of the robot's time, from its stream.
 
-    Joints (or positions and quaternions) are smoothed by local parabolas; how wide is found by leave-one-out prediction
+    Joints (or positions and quaternions) are smoothed by local parabolas. How wide is found by leave-one-out prediction
     of the stream itself, so that a clean stream is hardly touched, and jitter of its times and rounding are averaged.
     In between, cubic Hermite polynomials through the parabolas' values and slopes. No value is given across a gap or
     outside the stream.
@@ -96,7 +96,7 @@ class ContinuousMotion:
         ]
 
     def known(self, t: Array) -> Flags:
-        """Whether the stream has data at times (N,) s."""
+        """Return whether the stream has data at times (N,) s."""
         x = np.asarray(t, dtype=float) - self._zero
         k = np.clip(np.searchsorted(self._begins, x, side="right") - 1, 0, None)
         return np.asarray((x >= self._begins[k]) & (x <= self._ends[k]))
@@ -156,7 +156,7 @@ def _smoothed(t: Array, values: Array, bounds: NDArray[np.int64]) -> tuple[Array
     Half of that with the least leave-one-out error.
 
     That one balances noise and bias of a single time. Here the noise averages over the frames, while the bias where a
-    move's acceleration jumps is the same in every lap; half the width has a quarter of the bias and 1.4 times the
+    move's acceleration jumps is the same in every lap. Half the width has a quarter of the bias and 1.4 times the
     noise.
     """
     step = float(np.median(np.diff(t)))

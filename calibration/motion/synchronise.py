@@ -25,7 +25,7 @@ class Synchronised:
     """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found.
 
     ``clock`` of the frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation,
-    both None where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames;
+    both None where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames.
     ``source`` is "recording" or "calibration".
     """
 
@@ -106,7 +106,7 @@ def _search(
     X_BC: RigidTransform,
     X_FR: RigidTransform | None,
 ) -> float | None:
-    """The delay (s) with the least spread of the residuals; None where the spread hardly depends on it."""
+    """Return the delay (s) with the least spread of the residuals; None where the spread hardly depends on it."""
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < 3:
         return None

@@ -140,7 +140,7 @@ def _point_segment(points: Array, start: Array, end: Array) -> Array:
 
 @compiled()
 def _in_sight(eye: Array, targets: Array, b0: Array, b1: Array, radius: float, margin: float) -> bool:
-    """Whether the segment b0 b1 with a radius lies in a line of sight from the eye to a target.
+    """Return whether the segment b0 b1 with a radius lies in a line of sight from the eye to a target.
 
     Smallest distance of two segments and where on the first (0..1): closest points of the lines, clamped in turn.
     """
@@ -184,7 +184,7 @@ class Obstacle:
         return np.asarray(self._scene.compute_distance(query).numpy(), dtype=float)
 
     def blocks(self, eye: Array, targets: Array) -> bool:
-        """Whether a line of sight from the eye (3,) to one of the targets (N, 3) meets the surface."""
+        """Return whether a line of sight from the eye (3,) to one of the targets (N, 3) meets the surface."""
         rays = np.hstack([np.broadcast_to(eye, targets.shape), targets - eye]).astype(np.float32)
         return bool((self._scene.cast_rays(np.ascontiguousarray(rays))["t_hit"].numpy() < 1.0).any())
 

@@ -1,4 +1,4 @@
-"""Estimate the poses of a mounting and the scanner's correction from circles seen at known joint angles."""
+"""Estimate the poses of a mounting and the scanner's correction from circles at known joint angles."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class MountingResult(HandEyeResult):
         return np.asarray(self.slopes(p_C) @ self.with_factors @ self.slopes(p_C).T)
 
     def place(self, p_C: Array) -> Array:
-        """A scanned point (3,) m in the frame that carries the scanner."""
+        """Return a scanned point (3,) m in the frame that carries the scanner."""
         return np.asarray(self.X @ self.correction.points(p_C))
 
     def slopes(self, p_C: Array) -> Array:
@@ -137,7 +137,7 @@ def see_circle(
 def off_prediction(
     belief: MountingScene, seen: ObservedCircle, correction: ScannerCorrection | None
 ) -> tuple[float, float]:
-    """Distance (m) and angle (rad) of a seen circle from where a calibration expects it."""
+    """Return distance (m) and angle (rad) of an observed circle from where a calibration expects it."""
     p, n = seen.observation.p_CM, seen.observation.n_CM
     assert n is not None
     if correction is not None:
@@ -280,7 +280,7 @@ def _data(scene: MountingScene, seen: Sequence[ObservedCircle]) -> _Data:
 
 
 def _fitted(data: _Data, state: State, scene: MountingScene | None) -> _Fit:
-    """Gauss-Newton over poses, factors and links; the spreads are estimated on the way.
+    """Solve by Gauss-Newton over poses, factors and links, and estimate the spreads between steps.
 
     ``scene`` renews links and stops of ``data``.
     """
@@ -346,7 +346,7 @@ def _rows(data: _Data, state: State, correction: ScannerCorrection) -> tuple[Arr
 
 
 def _corrected(problem: Problem, p: Array, normal: Array) -> Problem:
-    """The problem with other centres (n, 3) and normals (n, 3) as measured."""
+    """Return the problem with other centres (n, 3) and normals (n, 3) as measured."""
     G = problem.G.copy()
     G[:, :3, 3] = p
     x = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])

@@ -130,7 +130,7 @@ def _way(
 
 
 def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
-    """Return the first n poses with a free way from home.
+    """Return the first n poses with a free path from home.
 
     The way home is the same backwards. Each pose is reached from the one before it where that is free too.
     """
@@ -236,7 +236,7 @@ def _in_view(scene: MountingScene, plan: MountingPlan, X_CR: RigidTransform) -> 
 
 
 def _greedy(scene: MountingScene, pool: Sequence[MountingPose], plan: MountingPlan) -> list[int]:
-    """All poses of the pool, each the one that adds most to those before it."""
+    """Return all poses of the pool, each the one that adds most to those before it."""
     if not pool:
         return []
     gains = information(scene, pool, plan.sigma_position_m, plan.sigma_normal_rad)

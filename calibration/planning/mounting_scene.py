@@ -94,7 +94,7 @@ class MountingScene:
         return tuple(found)
 
     def carried(self, q: Array, q_2: Array | None) -> list[CarriedLink]:
-        """The links whose errors move scanner or circle, but not both."""
+        """Return the links whose errors move scanner or circle, but not both."""
         end = 0 if self.two or self.configuration in FOOT else FLANGE
         frames = self.frames(q)
         found = [(frames, k, float(k < self.link) - float(k < end), self.sizes[0]) for k in range(FLANGE)]
@@ -114,7 +114,7 @@ class MountingScene:
         return self.arm_2 is not None
 
     def believing(self, poses: dict[str, RigidTransform]) -> MountingScene:
-        """The same scene with what a calibration found (letters X, Y, Z of the mounting's unknowns)."""
+        """Return the same scene with what a calibration found (letters X, Y, Z of the mounting's unknowns)."""
         found = replace(self, X_LC=poses.get("X", self.X_LC))
         if self.two:
             return replace(found, X_BD=poses.get("Y", self.X_BD), X_HR=poses.get("Z", self.X_HR))
@@ -160,14 +160,14 @@ class MountingScene:
     def observation(
         self, q: Array, q_2: Array | None, p_CR: Array, n_CR: Array, covariance: Array | None = None
     ) -> TargetObservation:
-        """A circle seen with the arms at q and q_2, as the solver takes it."""
+        """Return the observation of a circle with the arms at q and q_2, as the solver takes it."""
         frames = self.frames(q)
         X_DE = None if self.arm_2 is None or q_2 is None else link_frames(self.arm_2, q_2)[FLANGE]
         X_BL = frames[self.link] if "arm" in self.configuration else None
         return TargetObservation(X_BF=frames[FLANGE], p_CM=p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
 
     def problem(self, observations: Sequence[TargetObservation]) -> Problem:
-        """The equation of some observations."""
+        """Return the equation of some observations."""
         return problem_of(self.mounting, observations, self.known)
 
 
@@ -218,7 +218,7 @@ class Bodies:
         return min(low)
 
     def hidden(self, frames: list[RigidTransform], frames_2: list[RigidTransform] | None, X_BR: RigidTransform) -> bool:
-        """Whether a body stands between the scanner and the circle (of a base circle: the half that is on its side)."""
+        """Return whether a body is between scanner and circle (of a base circle: the half that is on its side)."""
         eye = np.asarray((frames[self.scene.link] @ self.scene.X_LC).translation())
         ring = self.scene.radius_m * np.column_stack([np.cos(_RING), np.sin(_RING), 0.0 * _RING])
         points = (X_BR @ ring.T).T

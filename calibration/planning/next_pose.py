@@ -28,8 +28,8 @@ _STEEPEST_RAD = float(np.radians(60.0))
 class VisibleVolume:
     """Visible volume.
 
-    ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data;
-    ``tilt_rad``: largest angle between the target's normal and the line of sight; ``source``: its description for
+    ``tan_x``, ``tan_y``: half field of view. ``near``, ``far``: along the optical axis, in the unit of the data.
+    ``tilt_rad``: largest angle between the target's normal and the line of sight. ``source``: its description for
     messages.
     """
 
@@ -49,7 +49,7 @@ class VisibleVolume:
 
 
 def tilt(G: Array) -> Array:
-    """Angles (n,) rad between the z axis of targets (n, 4, 4), whichever way it points, and the line of sight."""
+    """Return angles (n,) rad between the z axis of targets (n, 4, 4), of either sign, and the line of sight."""
     p = G[:, :3, 3]
     ray = p / np.maximum(np.linalg.norm(p, axis=1), 1e-12)[:, None]
     return np.asarray(np.arccos(np.clip(np.abs((ray * G[:, :3, 2]).sum(axis=1)), 0.0, 1.0)))
@@ -102,10 +102,11 @@ class NextPose:
     """A pose to add, and the predicted sigma (3-D) at the work point before and after.
 
     ``X_BF`` is the first robot's pose, or None where the mounting leaves it open; ``q`` (rad) its joint angles where a
-    robot was named. The target is turned from a taken sample, ``like``; ``checked`` says what was.
+    robot was named. The target, at X_CM, is turned from a taken sample, ``like``; ``checked`` says what was.
     """
 
     X_BF: RigidTransform | None
+    X_CM: RigidTransform
     like: int
     turn_deg: float
     axis_C: Array
@@ -149,7 +150,7 @@ def next_pose(
     The target is turned by 20, 40 or 60 degrees, and seen there or elsewhere.
 
     Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for
-    it within its limits; where none is named, or where it does not even reach the poses so far (another base or tool
+    it within its limits. Where none is named, or where it does not even reach the poses so far (another base or tool
     frame), the flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the
     target before the camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans
     with the arm's bodies too.
@@ -198,6 +199,7 @@ def next_pose(
     k, q = found
     return NextPose(
         X_BF=None if robot is None else as_transform(robot[k]),
+        X_CM=as_transform(G[k]),
         like=int(taken[like[k]]),
         turn_deg=float(np.degrees(angle[k])),
         axis_C=axis[k],
@@ -229,7 +231,7 @@ def _candidates(seen: Array, view: VisibleVolume) -> tuple[NDArray[np.int64], Ar
 def _reach(
     mounting: Mounting, F: Array, robot: Array | None, arm: Chain | None
 ) -> tuple[Callable[[int], tuple[bool, Array | None]], str, int]:
-    """Whether a candidate can be reached, with joint angles; in words; and how many to try (0: all)."""
+    """Return whether a candidate can be reached, with joint angles; in words; and how many to try (0: all)."""
     taken = _robot_poses(mounting, F)
     if robot is None or taken is None:
         return lambda _: (True, None), "Reach not checked: this mounting leaves the arm's pose open.", 0

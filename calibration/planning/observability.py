@@ -92,7 +92,7 @@ def turn_deg(poses: list[RigidTransform]) -> float:
 
 
 def has_orientations(poses: Sequence[RigidTransform]) -> bool:
-    """Whether orientations are given: pairs of centres without any carry the identity in every pose."""
+    """Return whether orientations are given: pairs of centres without any carry the identity in every pose."""
     return any(not X.rotation().IsExactlyIdentity() for X in poses)
 
 

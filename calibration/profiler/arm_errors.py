@@ -43,7 +43,7 @@ class ProfilerArmErrors:
 
     @staticmethod
     def none() -> ProfilerArmErrors:
-        """An arm as drawn."""
+        """Return an arm as drawn."""
         return ProfilerArmErrors.of(np.zeros(ARM_ERRORS))
 
 
@@ -70,7 +70,7 @@ class DhArm:
 
     @staticmethod
     def of(arm: ArmModel) -> DhArm:
-        """A UR arm's table, by the nominal lengths of its model."""
+        """Return a UR arm's table, by the nominal lengths of its model."""
         d, right = arm.dh, 0.5 * np.pi
         return DhArm(
             np.array(
@@ -115,7 +115,7 @@ class DhArm:
         return FlangePoses(X[:, :3, :3], X[:, :3, 3])
 
     def changed(self, table: Floats) -> DhArm:
-        """The same with errors (6, 3) of a, alpha and d added."""
+        """Return the same with errors (6, 3) of a, alpha and d added."""
         rows = np.array(self.rows)
         rows[:, TABLE] += table
         return DhArm(rows)

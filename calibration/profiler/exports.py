@@ -78,7 +78,7 @@ class Profiles:
 
 
 def read_profiles(path: Path, pitch_mm: float | None = None) -> Profiles:
-    """The profiles of one file.
+    """Return the profiles of one file.
 
     Args:
         path: an export of a profiler, or a table.
@@ -195,7 +195,7 @@ def _one_list(lists: list[Listing], name: str) -> Listing:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """A column's name and its unit: "X [mm]" and "x_mm" are x in mm."""
+    """Return a column's name and its unit: "X [mm]" and "x_mm" are x in mm."""
     plain = name.strip().lower()
     found = _UNIT.fullmatch(plain)
     if found is None or not found[1].strip(" _[("):
@@ -217,7 +217,7 @@ def _point_columns(header: tuple[str, ...]) -> tuple[int, int] | None:
 
 
 def _turns(header: tuple[str, ...]) -> bool:
-    """Whether the columns name rotations: x, y and z are then those of a pose."""
+    """Return whether the columns name rotations: x, y and z are then those of a pose."""
     return any(c.role not in ("x", "y", "z") for c in columns_of(list(header))[0])
 
 
@@ -226,12 +226,12 @@ def _has_poses(names: list[str]) -> bool:
 
 
 def _numbered(scan: Floats) -> np.ndarray[Any, Any]:
-    """The number of each row's profile, in the order of the scans' numbers."""
+    """Return the number of each row's profile, in the order of the scans' numbers."""
     return np.asarray(np.unique(scan, return_inverse=True)[1]).ravel()
 
 
 def _runs(poses: Floats) -> np.ndarray[Any, Any]:
-    """The number of each row's profile where no column tells it.
+    """Return the number of each row's profile where no column has it.
 
     Rows that follow each other with one pose, else each row.
     """
@@ -272,7 +272,7 @@ def _empty(z: Floats) -> np.ndarray[Any, Any]:
 
 
 def _columns_of_heights(blocks: list[NumberRows], header: tuple[str, ...], name: str) -> Profiles:
-    """A column of x and one column of heights for each profile."""
+    """Return a column of x and one column of heights for each profile."""
     names = [_split(h) for h in header]
     x = [k for k, (n, _) in enumerate(names) if n in ("x", "x coordinate", "x coordinates", "x position")]
     others = [k for k, (n, _) in enumerate(names) if k not in x and _NUMBERED.fullmatch(n)]
@@ -297,7 +297,7 @@ def _listed(header: tuple[str, ...]) -> str:
 
 
 def listed_columns(profiles: Profiles) -> str:
-    """The columns of a file for a message."""
+    """Return the columns of a file for a message."""
     return _listed(profiles.columns)
 
 
@@ -407,7 +407,7 @@ def _from_tree(path: Path) -> Profiles:
 
 
 def _plain(node: Any) -> Any:
-    """The tree with words such as .Nan as numbers."""
+    """Return the tree with words such as .Nan as numbers."""
     if isinstance(node, Mapping):
         return {str(k): _plain(v) for k, v in node.items()}
     if isinstance(node, list):
@@ -437,7 +437,7 @@ def _lists(node: Any, at: str) -> list[tuple[str, Floats | None]]:
 
 
 def joined(parts: list[Profiles], name: str) -> Profiles:
-    """The profiles of several files as one list, a file for each."""
+    """Return the profiles of several files as one list, a file for each."""
     units = {p.unit for p in parts}
     if len(units) > 1:
         raise InputError(

@@ -52,7 +52,7 @@ class ImportedProfiles:
 def import_profiles(
     path: Path, *, poses: Path | None = None, form: str = "", unit: str | None = None, pitch_mm: float | None = None
 ) -> ImportedProfiles:
-    """The profiles and poses of a file or folder.
+    """Return the profiles and poses of a file or folder.
 
     Args:
         path: a table, an export of a profiler, or a folder with one file per profile.
@@ -98,7 +98,7 @@ def import_profiles(
 
 
 def _poses_only(path: Path) -> Listing | None:
-    """The poses of a file without profiles.
+    """Return the poses of a file without profiles.
 
     None where it holds none, or numbers without names, which may be heights.
     """
@@ -112,7 +112,7 @@ def _poses_only(path: Path) -> Listing | None:
 
 
 def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, list[Path]]:
-    """The profiles of a file or folder, and the files that may hold the poses."""
+    """Return the profiles of a file or folder, and the files that may hold the poses."""
     if not path.is_dir():
         return read_profiles(path, pitch_mm), _beside(path)
     files = [
@@ -160,7 +160,7 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
 
 
 def _as_one(found: Profiles) -> Profiles:
-    """The rows of one file, each with a time of its own, as one profile at the first time."""
+    """Return the rows of one file, each with a time of its own, as one profile at the first time."""
     if not found.single or found.times is None or found.poses is not None:
         return found
     return replace(found, points=(np.vstack(found.points),), ids=(), times=found.times[:1], single=False)
@@ -189,7 +189,7 @@ def _beside(path: Path) -> list[Path]:
 
 
 def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | None) -> Listing:
-    """The list of the flange's poses: the stated file's, the table's own, or that of the files beside."""
+    """Return the list of the flange's poses: the stated file's, the table's own, or that of the files beside."""
     if stated is not None:
         files = (
             sorted((p for p in stated.iterdir() if p.is_file()), key=lambda p: natural(p.name))
@@ -230,10 +230,9 @@ def _no_poses(found: Profiles) -> str:
     columns = f" Its columns are {listed_columns(found)}." if found.columns else ""
     kind = f" ({found.form})" if found.form else ""
     return (
-        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Write the"
-        " flange's pose of each profile into a file poses.csv beside it, a row each, with the columns"
-        " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA), or name such a file with --poses"
-        " FILE."
+        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Add a"
+        " file poses.csv beside it, or name one with --poses FILE. It has one row for the flange's pose at each profile:"
+        " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA)."
     )
 
 
@@ -278,7 +277,7 @@ def _paired(listing: Listing, found: Profiles) -> tuple[np.ndarray, np.ndarray]:
 def _metric_poses(
     listing: Listing, rows: np.ndarray, unit: str | None
 ) -> tuple[tuple[PoseReading, ...], dict[str, object]]:
-    """The different readings of the poses, in metres, and how the list was understood."""
+    """Return the different readings of the poses, in metres, and how the list was understood."""
     readings: list[PoseReading] = []
     for one in pick(listing.readings, rows):
         if not any(np.abs(one.X - other.X).max() < 1e-9 for other in readings):

@@ -72,7 +72,7 @@ def checked_points(points: ArrayLike, count: int) -> Floats:
 
 
 def rotation_groups(poses: FlangePoses) -> NDArray[np.intp]:
-    """A number (n,) for each pose: poses of one orientation have the same, in the order in which they come."""
+    """Return a number (n,) for each pose: poses of one orientation have the same, in the order in which they come."""
     R = poses.rotation
     group = np.full(len(R), -1, dtype=np.intp)
     found = 0
@@ -106,7 +106,7 @@ def turned(R: Floats, w: Floats) -> Floats:
 
 
 def distinct(R: Floats, order: NDArray[np.intp]) -> list[int]:
-    """The first few of rotations (m, 3, 3), taken in that order, that differ from each other."""
+    """Return the first few of rotations (m, 3, 3), taken in that order, that differ from each other."""
     chosen: list[int] = []
     for k in order:
         if len(chosen) < KEPT and all(angle_of(R[k].T @ R[j]) > SAME_RAD for j in chosen):

@@ -59,7 +59,7 @@ def plan_edge_poses(
     sigma_xz_m: ArrayLike,
     field: Field | None = None,
 ) -> PosePlan:
-    """Choose candidates to add to an edge's scans; those from which the edge is not seen in the field are excluded.
+    """Choose candidates to add to an edge's scans; those without the edge in the field are excluded.
 
     Raises:
         InputError: no candidate sees the edge, or fewer than asked for.
@@ -140,7 +140,7 @@ def plan_sphere_poses(
 
 
 def _greedy(known: Floats, gains: Floats, names: NDArray[np.intp], maps: Floats, count: int) -> PosePlan:
-    """The best candidate at each step, by the mean trace of the mapped covariance of the sum."""
+    """Return the best candidate at each step, by the mean trace of the mapped covariance of the sum."""
     if len(names) < count:
         raise InputError(
             f"Of the candidate poses {len(names)} see the object in the field, fewer than the {count} asked for: give"

@@ -62,7 +62,7 @@ Fit = Callable[[FlangePoses], ReadingFit]
 
 
 def flange_poses(reading: PoseReading) -> FlangePoses:
-    """The poses of a reading."""
+    """Return the poses of a reading."""
     return FlangePoses.checked(reading.X[:, :3, :3], reading.X[:, :3, 3])
 
 
@@ -70,7 +70,7 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
     """Number of the reading under which the profiles show one target, and a sentence about it.
 
     If a reading were right, its residual would exceed that of the best by more than the root of the quantile of F(dof,
-    dof) with probability CHANCE at most; readings beyond it are rejected.
+    dof) with probability CHANCE at most. Readings beyond it are rejected.
 
     Args:
         readings: the candidates, the usual one first.
@@ -133,7 +133,7 @@ def _same(one: ReadingFit, other: ReadingFit) -> bool:
 
 
 def sphere_fit(profiles: Sequence[Floats], radius_m: float) -> Fit:
-    """The comparison of readings by arcs (m, 2) m of one sphere, one for each pose."""
+    """Return the comparison of readings by arcs (m, 2) m of one sphere, one for each pose."""
     thin = []
     for p in profiles:
         p = p[np.isfinite(p).all(axis=1)]
@@ -154,7 +154,7 @@ def sphere_fit(profiles: Sequence[Floats], radius_m: float) -> Fit:
 
 
 def edge_fit(points: Floats) -> Fit:
-    """The comparison of readings by points (n, 2) m of one edge, one for each pose."""
+    """Return the comparison of readings by points (n, 2) m of one edge, one for each pose."""
 
     def fit(poses: FlangePoses) -> ReadingFit:
         fits = [_of_edge(edge_optima(poses, points, s, np.full(2, s))[0][0], poses, points) for s in _SIGMAS_M]

@@ -39,7 +39,7 @@ class NumberRows:
 
 
 def separator_of(lines: list[str]) -> str:
-    """The mark between the cells of most lines: semicolon, tab, comma, or blanks."""
+    """Return the mark between the cells of most lines: semicolon, tab, comma, or blanks."""
     sample = [s for s in lines if re.search(r"\d", s)][:_SAMPLE]
     if not sample:
         return ","
@@ -53,7 +53,7 @@ def separator_of(lines: list[str]) -> str:
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """The cells of a line, stripped, with decimal points."""
+    """Return the cells of a line, stripped, with decimal points."""
     plain = re.sub(r"\s+([\[(])", r"\1", line).split() if separator == " " else line.split(separator)
     if separator not in line and len(words := line.split()) > 1 and all(map(_is_number, words)):
         plain = words  # blanks in one line of a table with another mark
@@ -68,7 +68,7 @@ def _is_number(word: str) -> bool:
 
 
 def number_in(cell: str) -> float | None:
-    """The number in a cell: NaN where it says that nothing was measured, None where it holds words."""
+    """Return the number in a cell: NaN where it says that nothing was measured, None where it holds words."""
     try:
         return None if "_" in cell else float(cell)
     except ValueError:
@@ -76,7 +76,7 @@ def number_in(cell: str) -> float | None:
 
 
 def blocks_of(text: str, name: str) -> list[NumberRows]:
-    """The blocks of a text: a blank line, a line of words or another header ends one.
+    """Return the blocks of a text: a blank line, a line of words or another header ends one.
 
     Raises:
         InputError: rows of a block have different lengths, or the file has more cells than are read.
@@ -166,12 +166,12 @@ class GocatorProfiles:
 
 
 def is_gocator(text: str) -> bool:
-    """Whether a text begins as the export of a Gocator does."""
+    """Return whether a text begins as the export of a Gocator does."""
     return _START.match(text[:200]) is not None
 
 
 def gocator_profiles(text: str, name: str) -> GocatorProfiles:
-    """The profiles of an export.
+    """Return the profiles of an export.
 
     Raises:
         InputError: no section with profiles, or one that is damaged; the sentence names the sections.
@@ -213,12 +213,12 @@ def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
 
 
 def _short(row: list[str]) -> list[str]:
-    """The row without empty cells at its end."""
+    """Return the row without empty cells at its end."""
     return row[: max((k + 1 for k, c in enumerate(row) if c), default=0)]
 
 
 def _data(rows: list[list[str]], first: str) -> tuple[list[str], list[list[str]]]:
-    """The header that begins with a word, and the rows below it."""
+    """Return the header that begins with a word, and the rows below it."""
     for k, row in enumerate(rows):
         if row[0].lower() == first and "axis" in (c.lower() for c in row):
             return _short(row), rows[k + 1 :]
@@ -290,7 +290,7 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
 
 
 def _column_count(rows: list[list[str]]) -> int | None:
-    """The number of columns that a section states."""
+    """Return the number of columns that a section states."""
     for head, values in pairwise(rows):
         stated = dict(zip((c.lower() for c in head), values, strict=False)).get("column count")
         if stated is not None:
@@ -299,7 +299,7 @@ def _column_count(rows: list[list[str]]) -> int | None:
 
 
 def _surface(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
-    """A surface of one frame: x in the first row, y in the first column, heights within."""
+    """Return a surface of one frame: x in the first row, y in the first column, heights within."""
     rows = [_short(row) for row in rows]
     widest = max((len(r) for r in rows), default=0)
     begin = next((k for k, r in enumerate(rows) if len(r) == widest and k > 1 and number_in(r[-1]) is not None), None)

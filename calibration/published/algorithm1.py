@@ -140,7 +140,7 @@ class VerificationError:
 
     @property
     def components(self) -> tuple[tuple[str, float, bool], ...]:
-        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre.
+        """Return (name, value in rad or m, whether it is observable) of each degree of freedom, at the flange centre.
 
         NaN where it could not.
         """
@@ -278,7 +278,7 @@ def registered(points: Array, model: Array, normals: Array, reach: float, method
 
 
 def _without_last_digits(X: Array) -> RigidTransform:
-    """A pose (4, 4) to 1e-10 m and rad.
+    """Return a pose (4, 4) to 1e-10 m and rad.
 
     Open3D's threads add up in any order, so that the last digits are others in each run.
     """
@@ -356,7 +356,7 @@ COSTS = ("translation", "translation_and_rotation", "work_radius")
 
 
 def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
-    """The cost a scenario asks for: the translation.
+    """Return the cost a scenario asks for: the translation.
 
     Section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius (``work_radius``); or a bound on the
     error at that radius (``translation_and_rotation``). Raises InputError.
@@ -379,8 +379,8 @@ def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST
 class Algorithm1State:
     """State of Algorithm 1 after k new scans; immutable, each step returns the next one.
 
-    ``pool``: up to four pairs; ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
-    until a registration succeeds; ``history`` has one (scans used, cost) entry per scan from the fourth on.
+    ``pool``: up to four pairs. ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
+    until a registration succeeds. ``history`` has one (scans used, cost) entry per scan from the fourth on.
     """
 
     e_required: float

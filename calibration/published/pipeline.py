@@ -142,7 +142,7 @@ class PublishedVerification:
 
 
 def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0) -> tuple[Array, Array]:
-    """The ground-true cloud of Fig. 6 in F.
+    """Return the ground-true cloud of Fig. 6 in F.
 
     Points (m, 3) m of a CAD model with sharp edges, sampled evenly over the face and the first 2 mm of its walls, and
     normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors' program (which makes them lean at every

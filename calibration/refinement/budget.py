@@ -57,7 +57,7 @@ class ErrorBudget:
 
     @property
     def next(self) -> Contribution:
-        """The source whose remedy reduces the total most."""
+        """Return the source whose correction reduces the total most."""
         return max(self.rows, key=lambda r: (1.0 - r.left**2) * r.mm**2)
 
     @property
@@ -71,7 +71,7 @@ class ErrorBudget:
         )
 
     def document(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         return {
             "p_B_mm": list(self.p_B_mm),
             "total_rms_mm": self.total_mm,
@@ -90,7 +90,7 @@ def error_budget(
     scale_error: float | None = None,
     refined: str = "",
 ) -> ErrorBudget:
-    """The budget at the middle of the inlier ``observations`` (as corrected), whose estimate this is.
+    """Return the budget at the middle of the inlier ``observations`` (as corrected), whose estimate this is.
 
     Measured: what is estimated (X_BC, correction) from its covariance, the part of the correction being what knowing it
     would take away; the noise of a scan from the fits; and, as the rest of the held-out errors, the arm's kinematics

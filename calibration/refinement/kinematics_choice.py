@@ -175,7 +175,7 @@ def choose_kinematics(
 
     The fit starts from the observations' plain estimate.
 
-    In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if
+    In ten folds both calibrations, choices included, are repeated without the held-out poses. The errors are applied if
     the mean falls by 5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The
     prior is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
 
@@ -191,9 +191,9 @@ def choose_kinematics(
     turned = turn_deg([o.X_BR for o in observations])
     if turned < LEAST_TURN_DEG:
         raise InputError(
-            f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told"
-            f" from the scanner's; turn and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine"
-            " local."
+            f"The orientation of the flange varies by {turned:.1f} degrees only. Errors of the arm (--refine {kind})"
+            f" cannot then be separated from errors of the scanner. Turn and tilt the flange by {LEAST_TURN_DEG:.0f}"
+            " degrees or more, or use --refine local."
         )
     factory = arm_errors(arm, kind)
     none = replace(factory, which=factory.which[:0], scale=factory.scale[:0], names=())
@@ -265,7 +265,7 @@ def choose_kinematics(
 def with_kinematics(
     estimate: CalibrationEstimate, choice: KinematicsChoice, observations: Sequence[Observation], q: Array
 ) -> tuple[CalibrationEstimate, list[Observation]]:
-    """The estimate of the accepted fit, and all observations as corrected by it."""
+    """Return the estimate of the accepted fit, and all observations as corrected by it."""
     f = choice.fit
     size = 6 + len(f.correction.values)
     moved = f.applied(observations, q)
@@ -292,7 +292,7 @@ def with_kinematics(
 
 
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
-    """The arm's link transforms with the errors found, as a file of Universal Robots' schema.
+    """Return the arm's link transforms with the errors found, as a file of Universal Robots' schema.
 
     m, rad; load_arm reads it.
     """
@@ -320,7 +320,7 @@ def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) ->
 
 
 def _told(fit: KinematicsFit) -> str:
-    """The errors that differ from zero by two sigma, the surest first."""
+    """Return the errors that differ from zero by two sigma, the surest first."""
     rows = sorted(
         zip(fit.errors.names, fit.values, fit.sigma, strict=True), key=lambda row: -abs(float(row[1] / row[2]))
     )

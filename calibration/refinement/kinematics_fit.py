@@ -45,7 +45,7 @@ class FactoryPrior:
     length_m: float = 1.2e-4
 
     def times(self, factor: float) -> FactoryPrior:
-        """The same, wider by this factor."""
+        """Return the same, wider by this factor."""
         return FactoryPrior(factor * self.offset_rad, factor * self.turn_rad, factor * self.length_m)
 
 
@@ -62,7 +62,7 @@ class ArmErrors:
     names: tuple[str, ...]
 
     def errors(self, u: Array) -> Array:
-        """The errors (n, 6) for u (k,) in units of the prior."""
+        """Return the errors (n, 6) for u (k,) in units of the prior."""
         out = np.zeros(6 * self.arm.n)
         out[self.which] = u * self.scale
         return out.reshape(-1, 6)
@@ -77,7 +77,7 @@ class ArmErrors:
 
 
 def unsought(arm: Chain, kind: str) -> ArmErrors | None:
-    """The errors of the links that ``kind`` does not seek; None where it seeks all."""
+    """Return the errors of the links that ``kind`` does not seek; None where it seeks all."""
     if kind == "links":
         return None
     every, sought = arm_errors(arm, "links"), set(arm_errors(arm, kind).which.tolist())
@@ -86,7 +86,7 @@ def unsought(arm: Chain, kind: str) -> ArmErrors | None:
 
 
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
-    """Return the errors of the arm that a scanner beside it can tell from its own pose.
+    """Return the errors of the arm that a scanner beside it can separate from its own pose.
 
     ``kind`` is "joints" for joint offsets, or "links" for all errors of the links.
 
@@ -134,7 +134,7 @@ class KinematicsFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)[-k:]) * self.errors.scale)
 
     def corrected_stack(self) -> Array:
-        """The arm's link transforms (n, 4, 4) with the errors found: m, rad."""
+        """Return the arm's link transforms (n, 4, 4) with the errors found: m, rad."""
         errors = self.errors.errors(self.u)
         return np.array(
             [X @ pose(exp_rotation(e[:3]), e[3:]) for X, e in zip(self.errors.arm.stack, errors, strict=True)]
@@ -304,7 +304,7 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
 
 
 def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
-    """Return position residuals (3 n) m, then those of the seen normals (3 n) rad, in the base.
+    """Return position residuals (3 n) m, then those of the observed normals (3 n) rad, in the base.
 
     The latter lie beside the normals of the reached poses X (n, 4, 4).
     """
@@ -319,7 +319,7 @@ def _seen(f: KinematicsFit, data: _Data) -> tuple[Array, Array]:
 
 
 def _beside(p: Array, normal: Array, data: _Data, X: Array) -> Array:
-    """The residuals of these centres and normals in the base."""
+    """Return the residuals of these centres and normals in the base."""
     e_p = p - X[:, :3, 3]
     e_n = np.where(data.has[:, None], np.cross(X[:, :3, 2], normal), 0.0)
     return np.concatenate([e_p.ravel(), e_n.ravel()])

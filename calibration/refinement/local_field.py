@@ -47,7 +47,7 @@ class LocalField:
     Residuals (n, 3) m are in the base, at ``places`` (n, 3) m and ``turns`` (n, 3, 3).
 
     The covariance of the field at two poses is ``sigma_field_m``^2 exp(-d^2 / 2 ``length_m``^2 - a^2 / 2
-    ``turn_rad``^2) for each axis, d their distance and a the angle between them; every scan has ``sigma_scan_m`` (per
+    ``turn_rad``^2) for each axis, d their distance and a the angle between them. Every scan has ``sigma_scan_m`` (per
     axis) of its own. Far from all poses, or at another orientation, the field is zero and its spread is
     ``sigma_field_m``. Source: Rasmussen and Williams 2006, 2.2 and 5.4.1.
     """
@@ -72,7 +72,7 @@ class LocalField:
         return k @ (self._inverse @ self.residuals), np.asarray(np.sqrt(left))
 
     def at_places(self, p_B: Array, R_BF: Array) -> Array:
-        """The field (m, 3) m at places (m, 3) m of a feature on a flange of one orientation (3, 3)."""
+        """Return the field (m, 3) m at places (m, 3) m of a feature on a flange of one orientation (3, 3)."""
         k = _kernel(p_B, R_BF[None], self.places, self.turns, self._values)
         return np.asarray(k @ (self._inverse @ self.residuals))
 
@@ -97,7 +97,7 @@ class LocalField:
         return np.asarray(np.linalg.inv(K + self.sigma_scan_m**2 * np.eye(len(K))))
 
     def document(self) -> dict[str, Any]:
-        """The field as plain types for calibration.yaml: lengths in m, orientations as quaternions wxyz."""
+        """Return the field as plain types for calibration.yaml: lengths in m, orientations as quaternions wxyz."""
         return {
             "length_m": self.length_m,
             "turn_rad": self.turn_rad,
@@ -136,7 +136,7 @@ def field_from_document(document: dict[str, Any] | None, file: str = "") -> Loca
 
 
 def fit_field(X_BR: Sequence[RigidTransform], residuals: Array) -> LocalField:
-    """The field through residuals (n, 3) m at n poses.
+    """Return the field through residuals (n, 3) m at n poses.
 
     Lengths and spreads maximise the marginal likelihood times a prior.
 

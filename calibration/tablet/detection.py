@@ -50,7 +50,7 @@ def find_marks(image: Grey, most: int, look: Look = "rings") -> tuple[Array, Arr
 
 
 def arrange(points: Array, full: Array | None, columns: int, rows: int) -> Array:
-    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2).
+    """Return the marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2).
 
     See find_landmarks.
     """
@@ -164,7 +164,7 @@ def _dots(grey: Grey, most: int) -> Array:
 
 
 def _as_grid(points: Array, columns: int, rows: int) -> Array | None:
-    """The points (n, 2) that make a grid, row by row from some corner; None where no choice of them does.
+    """Return the points (n, 2) that make a grid, row by row from some corner; None where no choice of them does.
 
     Every four points that could be the corners give a homography, and it must lead to a point of its own for every
     landmark: so that something else of the same look is excluded.
@@ -190,7 +190,7 @@ def _as_grid(points: Array, columns: int, rows: int) -> Array | None:
 
 
 def _turned(grid: Array, columns: int, rows: int) -> list[Array]:
-    """The grid (n, 2) row by row from each corner that it can start from; a page is never seen from behind."""
+    """Return the grid (n, 2) row by row from each corner at which it can start; a page always shows its front."""
     square = grid.reshape(rows, columns, 2)
     right, down = square[0, -1] - square[0, 0], square[-1, 0] - square[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:

@@ -36,7 +36,7 @@ _LEAST_READINGS = (
 
 @dataclass(frozen=True)
 class Queries:
-    """Points of the tablet that were seen but not used.
+    """Hold points of the tablet that are in the images but not used.
 
     Pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches them.
     """
@@ -102,7 +102,7 @@ def load_planar(path: Path) -> PlanarFile:
 
 
 def hand_step_m(visits: tuple[PlanarVisit, ...]) -> float:
-    """The step (m) to which hands were rounded when they were read off.
+    """Return the step (m) to which hands were rounded when they were read off.
 
     5, 2, 1 or 0.5 mm, or 0 where they are finer.
     """
@@ -137,7 +137,7 @@ def _read(path: Path) -> dict[str, Array]:
 
 
 def _of_visit(key: str, value: Array, k: int, m: int, path: Path) -> Array:
-    """The value of the k-th of m visits; a value without the visits' dimension belongs to all."""
+    """Return the value of the k-th of m visits; a value without the visits' dimension belongs to all."""
     own = {**DIMENSIONS, **QUERY_DIMENSIONS}[key]
     if value.ndim == own + 1 and len(value) == m and (key != "f" or m != 2):
         return np.asarray(value[k])

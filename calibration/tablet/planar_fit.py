@@ -34,8 +34,8 @@ class ClosedForm:
 class LinearFit:
     """Six-parameter calibration: hand = [a x - b y + t_x + x_p C - y_p S, -b x - a y + t_y - x_p S - y_p C].
 
-    x, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p, all m;
-    ``covariance`` (6, 6) m^2 from the residuals; ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted minus
+    x, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p, all m.
+    ``covariance`` (6, 6) m^2 from the residuals. ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted minus
     measured, the second by a fit that never saw that landmark. ``scale``: fitted over measured depth (1 for a perfect
     depth camera). ``condition``: of the column-scaled design.
     """
@@ -49,7 +49,7 @@ class LinearFit:
     condition: float
 
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
-        """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
+        """Return hand positions (m, 2) m from which the pen touches the points on rays (m, 2), at turns (m,) rad."""
         return np.asarray((_design(rays.T, theta_rad) @ self.parameters).T)
 
 
@@ -66,7 +66,7 @@ def _design(rays: Array, theta_rad: Array) -> Array:
 
 
 def solve_closed_form(rays: Array, hand: Array, theta_rad: Array) -> ClosedForm:
-    """The least squares itself, nothing checked: rays (2, n), hand (2, n) m, theta (n,) rad.
+    """Return the least squares itself, nothing checked: rays (2, n), hand (2, n) m, theta (n,) rad.
 
     Normal equations: with rays instead of millimetres the design's condition is below 1e2, so that squaring it costs
     four of sixteen digits. Left-out errors come from the leverages: e_i of the fit without both rows of landmark i is
@@ -147,7 +147,7 @@ class PlanarFit:
     """Calibration by the tablet's own size: hand = scale M(phi) p + t + pen(theta), M = [[c, s], [s, -c]].
 
     p: point of the tablet (m) that a pixel shows by ``X_CT``. ``parameters`` (6,) = phi (rad), t_x, t_y, x_p, y_p (m),
-    scale (1 unless it was freed); ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale;
+    scale (1 unless it was freed). ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale.
     ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted from the image minus measured, the second by a fit
     that saw that landmark neither touched nor in the image. ``free_scale``: (value, standard deviation) of a scale that
     the touches alone would like, a check of the tablet's pixels per inch.
@@ -162,7 +162,7 @@ class PlanarFit:
     free_scale: tuple[float, float]
 
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
-        """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
+        """Return hand positions (m, 2) m from which the pen touches the points on rays (m, 2), at turns (m,) rad."""
         return hand_over(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
 
 
@@ -190,7 +190,7 @@ def hand_over(parameters: Array, points_m: Array, theta_rad: Array) -> Array:
 def fit_plane_motion(points_m: Array, hand_m: Array, theta_rad: Array, free_scale: bool = False) -> Array:
     """Parameters (6,) minimising the squared differences of hand_over to ``hand_m`` (n, 2) m.
 
-    Translation and pen are linear and projected out; what remains is a quadratic in scale (cos phi, sin phi): solved as
+    Translation and pen are linear and projected out. What remains is a quadratic in scale (cos phi, sin phi): solved as
     it is with a free scale, else on the unit circle by Newton's method in phi.
     """
     n = len(points_m)

@@ -16,7 +16,7 @@ def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:
     """X_CT of the tablet (x right, y down the screen, z into it) from rays (n, 2) of its landmarks (n, 2) m.
 
     Starts are OpenCV's IPPE (a plane's two poses) and SQPnP (also where three of four landmarks lie on a line, which
-    leaves no homography); each is refined by Levenberg-Marquardt, and the one with the smallest reprojection error in
+    leaves no homography). Each is refined by Levenberg-Marquardt, and the one with the smallest reprojection error in
     front of the camera is taken. Raises TooFewLandmarks, CollinearLandmarks, and LandmarksNotFound where no pose
     explains the rays.
     """
@@ -43,11 +43,11 @@ def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:
                 best = error, RigidTransform(R, np.ravel(shift) - R.matrix() @ middle)
         if best is not None:
             return best[1]
-    raise LandmarksNotFound("No pose of the tablet explains where its landmarks were seen; check their order.")
+    raise LandmarksNotFound("No pose of the tablet fits the landmarks in the image: check their order.")
 
 
 def tablet_points(X_CT: RigidTransform, rays: Array) -> Array:
-    """Points (m, 2) m of the tablet that are seen along rays (m, 2): depth by the tablet's plane, not by its pixels."""
+    """Return points (m, 2) m of the tablet on rays (m, 2): depth by the tablet's plane, not by its pixels."""
     R, p = X_CT.rotation().matrix(), X_CT.translation()
     directions = np.c_[rays, np.ones(len(rays))]
     depth = (R[:, 2] @ p) / (directions @ R[:, 2])

@@ -89,7 +89,7 @@ def place_landmarks(
 
     HTM: Eqs. 1-11. DH: Eqs. 12-16, with the camera's and the tablet's translation (a, 0) as in modified DH.
     ``dh_offset_in_error``: Eq. 20 of the DH chain as the published figures have it, with the tablet's translation added
-    to a difference of points (homogeneous 1 in place of 0); False restores the 0. It changes nothing for HTM.
+    to a difference of points (homogeneous 1 in place of 0). False restores the 0. It changes nothing for HTM.
     """
     v = np.atleast_2d(parameters).T[:, :, None]
     zero = np.zeros_like(v[0])
@@ -186,7 +186,7 @@ def apply_affine(a: Array, points: Array, about: Array | None = None) -> Array:
 
 
 def fitness(residuals: Array) -> Fitness:
-    """The paper's figures from the differences (2 n, 2) mm of one parameter set."""
+    """Return the paper's figures from the differences (2 n, 2) mm of one parameter set."""
     d = np.linalg.norm(residuals.reshape(-1, 2), axis=-1)
     n = len(d) // 2
     f1, f2 = float(d[:n].mean()), float(d[n:].mean())
@@ -271,7 +271,7 @@ class StageResult:
 
 
 def from_the_middle(residuals: Residuals, search: Array) -> DistanceMinimum:
-    """The fast solver from the middle of the range, where there is no better idea."""
+    """Return the fast solver from the middle of the range, where there is no better idea."""
     return minimise_distances(residuals, search.mean(axis=1), search)
 
 
@@ -325,7 +325,7 @@ def hand_to_touch(
     theta_rad: Array,
     model: Model = "htm",
 ) -> Array:
-    """Return hand positions (m, 2) m from which the pen touches what is seen at ``uv_px`` (m, 2).
+    """Return hand positions (m, 2) m from which the pen touches the points at ``uv_px`` (m, 2).
 
     By Eq. 8, or by Eq. 25 with an affine pair (10,).
 

@@ -52,7 +52,7 @@ class TabletResult:
     data_sha256: dict[str, str] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
-        """The result in YAML's and JSON's own types."""
+        """Return the result in YAML's and JSON's own types."""
         return {
             "schema": 1,
             "software": software_version(),

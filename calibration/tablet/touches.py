@@ -85,7 +85,7 @@ class TabletTouches:
         return self.pitch_m * (self.landmark_px - self.delta_px)
 
     def pick(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> TabletTouches:
-        """The same visit with these landmarks only."""
+        """Return the same visit with these landmarks only."""
         rows = {
             f: getattr(self, f)[keep] for f in ("uv_px", "depth_m", "hand_m", "theta_rad", "delta_px", "landmark_px")
         }
@@ -122,7 +122,7 @@ def check_layout(landmarks: Array) -> None:
 
 
 def same_landmark(landmarks: Array) -> NDArray[np.int64]:
-    """A number (n,) from 0 for each of the landmarks (n, 2), the same for touches of the same one."""
+    """Return a number (n,) from 0 for each of the landmarks (n, 2), the same for touches of the same one."""
     if len(landmarks) == 0:
         return np.zeros(0, dtype=np.int64)
     extent = max(float(np.ptp(landmarks, axis=0).max()), 1e-12)
@@ -208,7 +208,7 @@ def _changed_reading(touched: Array, landmark: Array, mm_per_px: float, gap: flo
 
 
 def _scale(read: Array, landmark: Array) -> float:
-    """The factor that brings the touches' extent to the landmarks', any shift left open."""
+    """Return the factor that brings the touches' extent to the landmarks', any shift left open."""
     a, b = read - read.mean(axis=0), landmark - landmark.mean(axis=0)
     return float((a * b).sum() / max(float((a * a).sum()), 1e-12))
 

@@ -33,7 +33,7 @@ class ArmEffect:
     """``effect`` (n, 3, k) m: change of scanned minus touched by each error of the arm of one standard deviation.
 
     ``derivatives`` (n, 3, p) by what was estimated and its ``covariance`` (p, p) from the scans' noise and the prior
-    alone; ``noise``: share of the residuals' variance that is not the arm's.
+    alone. ``noise``: share of the residuals' variance that is not the arm's.
     """
 
     effect: Array
@@ -58,7 +58,7 @@ def arm_effect(
     A_t G) u (consider covariance, Schmidt 1966). None where the result does not hold its poses or its arm is not known.
 
     The calibration's own residuals bound this: their variance s^2 holds the arm's share a^2 = mean |(B - A G) u|^2 /
-    redundancy. Second: the share of s^2 that is not the arm's, 1 - a^2 / s^2 (at least 5 %); where a^2 is larger than
+    redundancy. Second: the share of s^2 that is not the arm's, 1 - a^2 / s^2 (at least 5 %). Where a^2 is larger than
     s^2 this arm is better than usual, and its errors are taken as smaller by s / a. Raises InputError where they cannot
     be read.
     """

@@ -35,7 +35,7 @@ class Touch:
 
     ``X_BF``: flange pose by the robot; ``p_FT`` (3,) m: centre of the tip's ball on the flange, ``radius`` m of that
     ball (0: a point). ``p_C`` (3,) m as the scanner gave it, not corrected: the point, a point of the plane or edge, or
-    the sphere's centre; ``direction_C`` (3,): outward normal of a plane, direction of an edge, else None;
+    the sphere's centre. ``direction_C`` (3,): outward normal of a plane, direction of an edge, else None.
     ``feature_radius`` m of a sphere. ``q`` (n,) rad where known.
     """
 
@@ -153,7 +153,7 @@ _LARGEST_RADIUS_M = 0.2  # a choice: larger than any ball, smaller than millimet
 
 
 def read_touches(path: Path, correction: ScannerCorrection | None = None) -> tuple[Touch, ...]:
-    """The touches of a table; ``correction`` is the result's, for spheres that are fitted to a cloud.
+    """Return the touches of a table; ``correction`` is the result's, for spheres that are fitted to a cloud.
 
     Raises:
         InputError: the file, a cell or a cloud cannot be used: one sentence with the row and what to change.
@@ -170,7 +170,7 @@ def read_touches(path: Path, correction: ScannerCorrection | None = None) -> tup
 
 
 def touches_text(touches: Sequence[Touch]) -> str:
-    """The table of touches, which read_touches reads."""
+    """Return the table of touches, which read_touches reads."""
     joints = max((len(t.q) for t in touches if t.q is not None), default=0)
     names = [*REQUIRED, *DIRECTION, "feature_radius", "sigma_tip", "sigma_radius", "sigma_scan"]
     names += [f"q{i + 1}" for i in range(joints)]
@@ -221,7 +221,7 @@ def _touch(row: dict[str, str], path: Path, correction: ScannerCorrection | None
 
 
 def _fitted(touch: Touch, row: dict[str, str], path: Path, correction: ScannerCorrection | None) -> Touch:
-    """The touch with its plane or sphere from the row's cloud, around the place that the row gives."""
+    """Return the touch with its plane or sphere from the row's cloud, around the place that the row gives."""
     if touch.feature in (POINT, EDGE):
         raise DatasetError(
             f"'{path.name}': a {touch.feature} ('{touch.id}') is not fitted to a cloud; give its place"

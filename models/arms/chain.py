@@ -50,12 +50,12 @@ def known_chains() -> tuple[str, ...]:
 
 
 def is_urdf(name: str) -> bool:
-    """Whether an arm's name is that of a URDF file."""
+    """Return whether an arm's name is that of a URDF file."""
     return name.lower().endswith(".urdf")
 
 
 def load_chain(name: str, kinematics: Path | None = None) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain.
+    """Return the arm of that name, or of a URDF file, as a chain.
 
     ``kinematics``: the file of one Universal Robots arm (see load_arm).
 
@@ -92,12 +92,12 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
 
 
 def chain_capsules(name: str) -> list[list[float]]:
-    """The capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
+    """Return the capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
     return [[float(v) for v in row] for row in yaml_load_file(str(_HERE / name / "chain.yaml"))["capsules"]]
 
 
 def chain_of(arm: ArmModel) -> Chain:
-    """A Universal Robots arm with its own kinematics as a chain."""
+    """Return a Universal Robots arm with its own kinematics as a chain."""
     return Chain(
         name=arm.name,
         joint_names=arm.joint_names,
@@ -141,7 +141,7 @@ def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
 def chain_inverse(chain: Chain, X_BF: RigidTransform, near: ArrayLike | None = None, *, seed: int = 0) -> Array | None:
     """Joint angles (n,) rad within the limits that put the flange at X_BF, or None where none was found.
 
-    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits; an arm
+    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits. An arm
     with more than six joints has whole families of answers, of which this is one. None is no proof that there is none:
     the closed form of inverse.inverse_kinematics is, for Universal Robots' arms. Raises InputError where X_BF is not
     finite.

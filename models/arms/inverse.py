@@ -24,7 +24,7 @@ _BRANCH_GAP_RAD = 0.1
 
 
 def inverse_kinematics(arm: ArmModel, X_BF: RigidTransform, free_wrist_3: float = 0.0) -> Array:
-    """All joint angles (n, 6) rad that put the flange at X_BF, wrapped to (-pi, pi] and within the limits.
+    """Return all joint angles (n, 6) rad that put the flange at X_BF, wrapped to (-pi, pi] and within the limits.
 
     Closed form on the nominal lengths: shoulder from the wrist centre, wrist 2 and wrist 3 from the orientation, elbow
     from the triangle of upper arm and forearm (after Hawkins, Analytic Inverse Kinematics for the Universal Robots,
@@ -154,7 +154,7 @@ def _arccos(cosine: float) -> float | None:
 
 
 def _both_signs(angle: float) -> tuple[float, ...]:
-    """The two branches +-angle, and seeds beside them where they nearly meet."""
+    """Return the two branches +-angle, and seeds beside them where they nearly meet."""
     return (angle, -angle) if angle > _BRANCH_GAP_RAD else (angle, -angle, _BRANCH_GAP_RAD, -_BRANCH_GAP_RAD)
 
 

@@ -111,7 +111,7 @@ def known_arms() -> tuple[str, ...]:
 
 
 def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
-    """The arm `name` with its nominal kinematics, or with a robot's factory calibration read from `kinematics`.
+    """Return the arm `name` with its nominal kinematics, or with a robot's factory calibration read from `kinematics`.
 
     `kinematics` is a file of the schema of Universal Robots' ROS 2 description (top-level key `kinematics`; m, rad; an
     optional `hash`). Its link frames are slid along their own joint axes to where the nominal ones lie, which changes
@@ -135,7 +135,7 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
 
 @lru_cache(maxsize=8)
 def _nominal(name: str) -> ArmModel:
-    """An arm that is known, read once: a run asks for it a hundred times."""
+    """Return an arm that is known, read once: a run asks for it a hundred times."""
     folder = _HERE / name
     stack, _ = _read_kinematics(folder / "default_kinematics.yaml")
     limits = _read(folder / "joint_limits.yaml", "joint_limits")
@@ -175,14 +175,14 @@ def _nominal(name: str) -> ArmModel:
 
 
 def mounted(arm: ArmModel, X_WB: RigidTransform) -> ArmModel:
-    """The same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
+    """Return the same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
     # exactly +z for an upright base: rounding must not change a plan
     up = X_WB.rotation().matrix()[2]
     return replace(arm, up=_frozen(np.where(np.abs(up - np.round(up)) < 1e-12, np.round(up), up)))
 
 
 def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:
-    """The same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
+    """Return the same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
 
     As in `load_arm`, the link frames are slid along their own joint axes to where those of `arm` lie, which changes no
     flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these
@@ -261,7 +261,7 @@ def joint_frames(stack: Array, q: Array) -> Array:
 
 
 def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
-    """The same chain with each frame but the last slid along its own joint axis, nearest to its nominal place.
+    """Return the same chain with each frame but the last slid along its own joint axis, nearest to its nominal place.
 
     A slide along z_i commutes with the rotation about z_i, so X_{i-1,i} RotZ(q_i) may be split on either side of it.
     """
@@ -301,7 +301,7 @@ def _read_kinematics(path: Path) -> tuple[Array, str]:
 
 
 def _read(path: Path, section: str) -> Mapping[str, Any]:
-    """The mapping under the top-level key `section` of a YAML file."""
+    """Return the mapping under the top-level key `section` of a YAML file."""
     if not path.exists():
         raise InputError(f"{path} cannot be read (it does not exist); name an existing YAML file.")
     data = read_document(path)
@@ -313,7 +313,7 @@ def _read(path: Path, section: str) -> Mapping[str, Any]:
 
 
 def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) -> float:
-    """A finite number at section[keys[0]][keys[1]]...; YAML 1.1 leaves 1e-05 as text, which is accepted."""
+    """Return a finite number at section[keys[0]][keys[1]]...; YAML 1.1 leaves 1e-05 as text, which is accepted."""
     value: Any = section
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None

@@ -123,7 +123,7 @@ class _Sizes:
 
     @staticmethod
     def of(arm: ArmModel) -> "_Sizes":
-        """The sizes of an arm."""
+        """Return the sizes of an arm."""
         h = arm.housings
         return _Sizes(h.shoulder, h.elbow, h.wrist, h.shoulder / _BIG, h.elbow / _ELBOW, h.wrist / _WRIST)
 
@@ -229,7 +229,7 @@ _ALONG = {"x": (0.0, np.pi / 2, 0.0), "y": (np.pi / 2, 0.0, 0.0), "z": (0.0, 0.0
 
 
 def _at(axis: str, off_axis: tuple[float, float], along: float) -> tuple[float, float, float]:
-    """The point at `along` on a line parallel to `axis` that passes the other two coordinates at `off_axis`."""
+    """Return the point at `along` on a line parallel to `axis` that passes the other two coordinates at `off_axis`."""
     a, b = off_axis
     return {"x": (along, a, b), "y": (a, along, b), "z": (a, b, along)}[axis]
 
@@ -254,7 +254,7 @@ def _seal(link: int, axis: str, off_axis: tuple[float, float], start: float, rad
 def _cap(
     link: int, axis: str, off_axis: tuple[float, float], start: float, sign: float, radius: float
 ) -> tuple[_Solid, _Solid]:
-    """A low rim and a flat dome on the blind end of a housing, towards `sign` along `axis`."""
+    """Return a low rim and a flat dome on the blind end of a housing, towards `sign` along `axis`."""
     rim = 0.1 * radius
     low, high = sorted((start, start + sign * rim))
     dome = (0.9 * radius, 0.9 * radius, 0.9 * radius * _DOME - rim)
@@ -297,7 +297,7 @@ def link_index(arm: ArmModel, link: str) -> int:
 
 
 def link_solids(arm: ArmModel, link: int) -> list[TriMesh]:
-    """The closed solids that a link consists of, in its frame, m; they overlap.
+    """Return the closed solids that a link consists of, in its frame, m; they overlap.
 
     Cylinders and ellipsoids with the published radii and lengths: housings, tubes and caps, without screws and seams.
     """
@@ -308,7 +308,7 @@ def link_solids(arm: ArmModel, link: int) -> list[TriMesh]:
 
 
 def placed_solid(visual: ET.Element) -> TriMesh:
-    """The closed solid of a visual element of arm_urdf, in its link's frame, m."""
+    """Return the closed solid of a visual element of arm_urdf, in its link's frame, m."""
     origin, geometry = visual.find("origin"), visual.find("geometry")
     assert origin is not None
     assert geometry is not None

@@ -37,9 +37,9 @@ class UrdfChain(NamedTuple):
 
 
 def read_urdf_chain(path: Path) -> UrdfChain:
-    """The chain of a URDF file; meshes are not needed.
+    """Return the chain of a URDF file; meshes are not needed.
 
-    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root; the flange is `tool0`
+    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root. The flange is `tool0`
     or `flange` (z out of it), else the last link.
 
     Raises:
@@ -113,7 +113,7 @@ def _flange(path: Path, bodies: dict[str, RigidBody], above: dict[str, Joint]) -
 
 
 def _between(path: Path, base: str, flange: str, above: dict[str, Joint]) -> list[RevoluteJoint]:
-    """The revolute joints from the base's root to the flange; fixed joints are passed."""
+    """Return the revolute joints from the base's root to the flange; fixed joints are passed."""
     found: list[RevoluteJoint] = []
     name = flange
     while name in above and name != base:

@@ -15,7 +15,7 @@ MOST_TRIANGLES = 200_000
 
 
 def enclosing_capsule(shape: ToolShape) -> Capsule:
-    """A capsule in F that holds the whole shape: about its longest direction."""
+    """Return a capsule in F that holds the whole shape: about its longest direction."""
     X = shape.place.pose
     size = shape.size
     if shape.kind == "sphere":
@@ -70,5 +70,5 @@ def _read(path: str, unit_m: float, changed: int) -> TriMesh:
 
 
 def shape_mesh(shape: ToolShape) -> TriMesh:
-    """The mesh of a shape's file, in its own frame, m. Raises InputError where the file holds none."""
+    """Return the mesh of a shape's file, in its own frame, m. Raises InputError where the file holds none."""
     return _read(shape.mesh, shape.unit_m, Path(shape.mesh).stat().st_mtime_ns)

@@ -54,7 +54,7 @@ class FingerFile:
 
 @lru_cache(maxsize=8)
 def read_finger_file(path: Path) -> FingerFile:
-    """The calibration of a finger. Raises InputError where the file is not one."""
+    """Return the calibration of a finger. Raises InputError where the file is not one."""
     document = read_document(path)
     try:
         if document["schema"] != SCHEMA:

@@ -89,7 +89,7 @@ class TagPart:
 
 @dataclass(kw_only=True)
 class ShapePart:
-    """A body of the tool: drawn, seen by the scanner, and kept clear of the table and of the line of sight.
+    """Describe a body of the tool: drawn, visible to the scanner, clear of the table and of the line of sight.
 
     One kind of a shape.
     """
@@ -168,13 +168,13 @@ class LoadedTool:
 
 
 def tool_file(name: Path) -> Path:
-    """The file of a tool that is given by its path, or by the name of one that weldcal has, such as tip_1p5."""
+    """Return the file of a tool that is given by its path, or by the name of one that weldcal has, such as tip_1p5."""
     own = WELDING.parent / f"{name}.yaml"
     return own if not name.is_file() and own.is_file() else name
 
 
 def load_tool(path: Path) -> LoadedTool:
-    """The tool of a file; files that it names are relative to it.
+    """Return the tool of a file; files that it names are relative to it.
 
     Raises:
         InputError: the file cannot be read, has an unknown key, or describes a tool that cannot be.
@@ -265,8 +265,8 @@ def check_sight(loaded: LoadedTool) -> Array:
         )
     if facing < np.cos(np.deg2rad(60.0)):
         raise InputError(
-            f"'{file}': the tag does not face the finger camera: its z must point back at it, and it stands "
-            f"{np.rad2deg(np.arccos(np.clip(facing, -1.0, 1.0))):.0f} deg away; check tag.rpy_deg."
+            f"'{file}': the tag does not face the finger camera. The tag's z axis must point at the camera, and it is "
+            f"{np.rad2deg(np.arccos(np.clip(facing, -1.0, 1.0))):.0f} deg off: correct tag.rpy_deg."
         )
     half = 0.5 * tool.tag_size_m * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     p_K = half @ X_KM.rotation().matrix().T + X_KM.translation()
@@ -372,7 +372,7 @@ def _shape(path: Path, i: int, part: ShapePart) -> ToolShape:
 
 
 def _keep_clear(part: ToolPart, shapes: tuple[ToolShape, ...]) -> tuple[Capsule, ...]:
-    """The file's capsules, or capsules about the shapes, the finger and the wire."""
+    """Return the file's capsules, or capsules about the shapes, the finger and the wire."""
     if part.keep_clear:
         return tuple(
             Capsule(LAST_LINK, np.array(_metres(c.from_mm)), np.array(_metres(c.to_mm)), c.radius_mm / 1e3)

@@ -116,14 +116,14 @@ class SolidFace:
         return curves, np.vstack(starts), np.vstack(chords), np.vstack(parameters), np.concatenate(of)
 
     def _over(self, p: Floats) -> Floats | None:
-        """The point of the surface that is nearest to a point; None where the face does not reach."""
+        """Return the point of the surface that is nearest to a point; None where the face does not reach."""
         at = self._by_border.ValueOfUV(gp_Pnt(*p), EXACT_MM)
         if self._inside.Perform(at) in (TopAbs_State.TopAbs_IN, TopAbs_State.TopAbs_ON):
             return array_of(self._by_border.Value(at.X(), at.Y()))
         return None
 
     def foot(self, p: Floats) -> Floats:
-        """The point of the face that is nearest to a point.
+        """Return the point of the face that is nearest to a point.
 
         Of a bent face one at which the distance is least in its vicinity.
         """
@@ -162,7 +162,7 @@ class Solid:
         return faces_at(self.solid, self.faces)
 
     def holds(self, p: Floats) -> bool:
-        """Whether a point is inside."""
+        """Return whether a point is inside."""
         if (p < self.low).any() or (p > self.high).any():
             return False
         hits = [self._hits(p, along) for along in RAYS]
@@ -238,7 +238,7 @@ class MeshFace(SolidFace):
         return found if inside.any() else None
 
     def _nearest(self, p: Floats) -> tuple[Floats, int]:
-        """The nearest point of the triangles, and the number of its triangle."""
+        """Return the nearest point of the triangles, and the number of its triangle."""
         a, d = self.triangles - p, np.roll(self.triangles, -1, axis=1) - self.triangles
         n = np.cross(d[:, 0], d[:, 1])
         n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
@@ -265,7 +265,7 @@ class MeshBody(Solid):
                 face.edges.append(edge)
 
     def holds(self, p: Floats) -> bool:
-        """Whether a point is inside, by the solid angle of the shell (Van Oosterom and Strackee 1983)."""
+        """Return whether a point is inside, by the solid angle of the shell (Van Oosterom and Strackee 1983)."""
         if (p < self.low).any() or (p > self.high).any():
             return False
         v = self._triangles - p
@@ -290,7 +290,7 @@ class MeshBody(Solid):
 
 
 def _edge_along(line: Floats) -> Any:
-    """The edge along a line (N,3): straight, a circle or a smooth curve through its points."""
+    """Return the edge along a line (N,3): straight, a circle or a smooth curve through its points."""
     p, q = gp_Pnt(*line[0]), gp_Pnt(*line[-1])
     closed = len(line) > 3 and float(np.linalg.norm(line[0] - line[-1])) < EXACT_MM
     if not closed and (len(line) == 2 or _beside_chord(line) < ROUGH_MM):
@@ -324,7 +324,7 @@ def _beside_chord(line: Floats) -> float:
 
 
 def parts_of(shape: Any, kind: Any) -> list[Any]:
-    """The parts of a shape of one kind, in the file's order."""
+    """Return the parts of a shape of one kind, in the file's order."""
     explorer, found = TopExp_Explorer(shape, kind), []
     while explorer.More():
         found.append(explorer.Current())
@@ -346,7 +346,7 @@ def faces_at(shape: Any, faces: list[SolidFace]) -> list[tuple[Any, list[SolidFa
 
 
 def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
-    """The middle of a stretch of a curve, its direction there, and its length."""
+    """Return the middle of a stretch of a curve, its direction there, and its length."""
     point, along = gp_Pnt(), gp_Vec()
     curve.D1(0.5 * (begin + end), point, along)
     return array_of(point), unit(array_of(along)), (end - begin) * along.Magnitude()
@@ -381,7 +381,7 @@ def unit(v: Floats) -> Floats:
 
 
 def _end_of(face: SolidFace, edge: Any) -> tuple[Floats, Floats, Floats] | None:
-    """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
+    """Return an edge's middle, the face's normal there, and the direction out of the face in its plane."""
     curve = BRepAdaptor_Curve(edge)
     straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
     if BRep_Tool.Degenerated_s(edge) or not (

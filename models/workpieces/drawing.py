@@ -30,7 +30,7 @@ _CORNER_RAD = math.radians(25.0)
 def draw_seam(
     mesh: TriMesh, line: Floats, joint: str, normals: Floats | None = None, closed: bool = False
 ) -> DrawnSeam:
-    """The seam along a line (N,3) m in P, N >= 2, at the joint nearest to it.
+    """Return the seam along a line (N,3) m in P, N >= 2, at the joint nearest to it.
 
     Args:
         normals: (N,3), roughly out of the joint towards the tool; needed only where a line lies at two joints.
@@ -53,7 +53,7 @@ def draw_seam(
 
 
 def goes_on(mesh: TriMesh, seam: DrawnSeam, by_m: float = 0.004) -> bool:
-    """Whether the joint continues beyond the seam's end, by the cut a little further on."""
+    """Return whether the joint continues beyond the seam's end, by the cut a little further on."""
     if seam.closed:
         return True
     t, up = seam.tangents_P[-1:], seam.up_P[-1:]
@@ -73,7 +73,7 @@ class _Fit:
 
 
 def resampled(line: Floats, normals: Floats | None, closed: bool) -> tuple[Floats, Floats | None]:
-    """The line at even spacing with the normals carried along; a closed one ends where it starts.
+    """Return the line at even spacing with the normals carried along; a closed one ends where it starts.
 
     Raises:
         InputError: less than two different points, or shorter than 4 mm.
@@ -154,8 +154,8 @@ def _fitted(mesh: TriMesh, points: Floats, t: Floats, ups: Floats | None, joint:
     if (trimmed > _TRIMMED_M or holes > 0.1 * n * SPACING_M + 2e-3) and not (closed and trimmed <= holes):
         at_mm = 1e3 * SPACING_M * int(np.argmin(good))
         raise InputError(
-            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam (the first at {at_mm:.1f} mm) the part has no"
-            f" {joint} joint within {1e3 * FARTHEST_M:.0f} mm of the line: check the line, its unit and the joint."
+            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam, first at {at_mm:.1f} mm, the part has no"
+            f" {joint} joint within {1e3 * FARTHEST_M:.0f} mm of the line. Check the line, its unit and the joint."
         )
     keep = slice(first, last + 1)
     s = np.arange(n)[keep]
@@ -196,7 +196,7 @@ def _fits(opening: Opening, joint: str) -> bool:
 
 
 def _chosen(section: Section, joint: str, wanted: Floats) -> tuple[Opening, Floats, float] | None:
-    """The joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap.
+    """Return the joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap.
 
     None without one.
     """
@@ -273,7 +273,7 @@ def _heights(
 
 
 def _even(found: _Fit, joint: str, closed: bool) -> DrawnSeam:
-    """The seam evenly spaced along its root."""
+    """Return the seam evenly spaced along its root."""
     steps = np.linalg.norm(np.diff(found.root, axis=0), axis=1)
     s = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.linspace(0.0, s[-1], max(5, round(s[-1] / SPACING_M) + 1))
@@ -314,7 +314,7 @@ def _filled(values: Floats, good: npt.NDArray[np.bool_], s: npt.NDArray[np.int64
 
 
 def _smoothed(values: Floats, closed: bool, t: Floats) -> Floats:
-    """The values along the seam without the facets of its mesh; each leg between corners by itself."""
+    """Return the values along the seam without the facets of its mesh; each leg between corners by itself."""
     turn = np.arccos(np.clip(np.sum(t[1:] * t[:-1], axis=1), -1.0, 1.0))
     cuts = np.flatnonzero(turn > _CORNER_RAD) + 1
     if closed and not len(cuts):

@@ -73,7 +73,7 @@ class Piece:
 
 
 def joints_of(shape: Any) -> list[list[Piece]]:
-    """The joints of a shape: see `joints_between`."""
+    """Return the joints of a shape: see `joints_between`."""
     return joints_between([Solid(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
 
 
@@ -119,7 +119,7 @@ def _check_time(begin: float, bodies: Sequence[Solid]) -> None:
 
 
 def _within(bodies: Sequence[Solid], k: int, begin: float) -> Iterable[Piece]:
-    """The pieces along the concave edges of one body."""
+    """Return the pieces along the concave edges of one body."""
     for edge, met in bodies[k].edges:
         if len(met) != 2:
             continue
@@ -158,7 +158,7 @@ def _far(a: SolidFace | Solid, b: SolidFace | Solid) -> bool:
 
 
 def _met(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
-    """The pieces along which two faces meet in a concave joint."""
+    """Return the pieces along which two faces meet in a concave joint."""
     if f.surface is None or g.surface is None:
         return
     if f.round and g.round and _coaxial(f, g, 0.01):
@@ -192,7 +192,7 @@ def _met(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidF
 def _between(
     bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace, curve: Any, begin: float, end: float
 ) -> dict[str, Any] | None:
-    """The joint of two faces along a stretch of their curve; None where they form none.
+    """Return the joint of two faces along a stretch of their curve; None where they form none.
 
     A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
     """
@@ -321,12 +321,12 @@ def _cut(
 
 
 def _coaxial(a: SolidFace, b: SolidFace, angle_rad: float) -> bool:
-    """Whether two cylinders have one axis, also where these point against each other."""
+    """Return whether two cylinders have one axis, also where these point against each other."""
     return any(a.axis.IsCoaxial(axis, angle_rad, GAP_MM) for axis in (b.axis, b.axis.Reversed()))
 
 
 def _of_pipe(f: SolidFace, g: SolidFace, t: Floats, two: tuple[Solid, Solid]) -> str:
-    """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
+    """Return the joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
     if len(axes) == 2:
         return "" if axes[0][1].IsParallel(axes[1][1], 0.1) else "pipe on pipe"
@@ -377,13 +377,13 @@ def _flush(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: Soli
 
 
 def _facing(two: tuple[Solid, Solid], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
-    """Whether both bodies are as near to each other below the flush faces: a groove is wider there."""
+    """Return whether both bodies are as near to each other below the flush faces: a groove is wider there."""
     down = x - min(1.0, 0.5 * depth) * n
     return all(two[k].holds(down + s * (0.5 * abs(gap) + 0.3) * m) for k, s in ((0, -1.0), (1, 1.0)))
 
 
 def _shared(first: Any, second: Any, m: Floats, gap: float) -> Floats | None:
-    """The line midway between two edges as far as both run beside each other; None where they do not."""
+    """Return the line midway between two edges as far as both run beside each other; None where they do not."""
     a, b = BRepAdaptor_Curve(first), BRepAdaptor_Curve(second)
     ends = [[array_of(c.Value(u)) for u in (c.FirstParameter(), c.LastParameter())] for c in (a, b)]
     if a.GetType() != GeomAbs_CurveType.GeomAbs_Line:
@@ -417,7 +417,7 @@ def chains(pieces: Iterable[Piece]) -> list[list[Piece]]:
 
 
 def _follows(chain: list[Piece], at: int, piece: Piece) -> bool:
-    """Whether a piece goes on where a chain ends (-1) or begins (0)."""
+    """Return whether a piece goes on where a chain ends (-1) or begins (0)."""
     gaps = np.linalg.norm(piece.line[[0, -1]] - chain[at].line[at], axis=1)
     same = (piece.angle > math.pi - 0.01) == (chain[at].angle > math.pi - 0.01)
     # Where the edges of two plates touch there is a joint on either side of one line.
@@ -426,6 +426,6 @@ def _follows(chain: list[Piece], at: int, piece: Piece) -> bool:
 
 
 def closes(chain: list[Piece]) -> bool:
-    """Whether a seam ends where it begins."""
+    """Return whether a seam ends where it begins."""
     apart = float(np.linalg.norm(chain[0].line[0] - chain[-1].line[-1]))
     return apart < CHAINED_MM and sum(len(piece.line) for piece in chain) > 4

@@ -34,7 +34,7 @@ MOST_MISSED, MUCH = 200, 10.0  # tries of cylinders that fail; a plane among ben
 
 
 def mesh_edges(mesh: TriMesh) -> tuple[PartEdge, ...]:
-    """The sharp edges of a closed mesh, numbered: the concave ones first, each by falling length."""
+    """Return the sharp edges of a closed mesh, numbered: the concave ones first, each by falling length."""
     pairs, sides = _shared(mesh)
     n = mesh.normals
     first, second = n[sides[:, 0]], n[sides[:, 1]]
@@ -80,7 +80,7 @@ def _chained(vertices: Floats, pairs: Ints, turn: Floats) -> list[tuple[Floats, 
         around.setdefault(b, []).append(k)
 
     def onward(k: int, at: int) -> tuple[int, int] | None:
-        """The one edge that goes on from a vertex without a corner, and its other end."""
+        """Return the one edge that goes on from a vertex without a corner, and its other end."""
         others = [j for j in around[at] if j != k]
         if len(others) != 1:
             return None
@@ -143,8 +143,8 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     mesh, body = _bodies(read_surface(path, unit_m))
     if not mesh.watertight():
         raise InputError(
-            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a"
-            " solid."
+            f"'{path.name}' is not a closed surface: it has a hole, or some triangles face inward and others outward."
+            " Repair it to a closed solid."
         )
     if mesh.volume < 0.0:
         mesh = mesh.flipped()
@@ -159,7 +159,7 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
 
 
 def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
-    """The mesh with corners of its own for each body, and the body (M,) of each triangle.
+    """Return the mesh with corners of its own for each body, and the body (M,) of each triangle.
 
     Bodies that touch share no corner.
 
@@ -193,7 +193,7 @@ def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
 
 
 def _apart(mesh: TriMesh) -> Ints:
-    """The body (M,) of each triangle where bodies may touch in an edge.
+    """Return the body (M,) of each triangle where bodies may touch in an edge.
 
     Two of more triangles at it bound the same material.
     """
@@ -221,7 +221,7 @@ def _apart(mesh: TriMesh) -> Ints:
 
 
 def _solids(mesh: TriMesh, body: Ints) -> list[MeshBody]:
-    """The bodies of a mesh with their faces, mm; the skin of a cavity belongs to the body around it."""
+    """Return the bodies of a mesh with their faces, mm; the skin of a cavity belongs to the body around it."""
     from weldcal.models.workpieces.brep import MeshBody, MeshFace
 
     shells = [TriMesh(1e3 * mesh.vertices, mesh.triangles[body == k]) for k in range(int(body.max()) + 1)]
@@ -248,7 +248,7 @@ def _solids(mesh: TriMesh, body: Ints) -> list[MeshBody]:
 
 
 def _borders(mesh: TriMesh, label: Ints) -> list[tuple[Floats, list[int]]]:
-    """The lines (N,3) along which two regions meet, each with the two."""
+    """Return the lines (N,3) along which two regions meet, each with the two."""
     pairs, sides = _shared(mesh)
     met = np.sort(label[sides], axis=1)
     apart = met[:, 0] != met[:, 1]
@@ -265,7 +265,7 @@ def _borders(mesh: TriMesh, label: Ints) -> list[tuple[Floats, list[int]]]:
 
 
 def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | None]]:
-    """The planes and cylinders of a closed mesh, mm.
+    """Return the planes and cylinders of a closed mesh, mm.
 
     Returns:
         The region (M,) of each triangle, and of each region a point, the normal or the axis, and 0 or the radius,
@@ -326,7 +326,7 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
 def _cylinder(
     seed: int, other: int, points: list[Floats], middle: list[Floats], near: list[set[int]], taken: Ints
 ) -> tuple[list[int], tuple[Floats, Floats, float]] | None:
-    """The patches around two that lie on one cylinder, and that: a point, its axis and its radius.
+    """Return the patches around two that lie on one cylinder, and that: a point, its axis and its radius.
 
     None for fewer than four.
     """
@@ -358,7 +358,7 @@ def _cylinder(
 
 
 def _fitted(points: Floats, along: Floats, steps: int) -> tuple[Floats, Floats, float] | None:
-    """The cylinder through points (N,3).
+    """Return the cylinder through points (N,3).
 
     A point, its axis and its radius, by least squares in so many steps from a rough axis.
     """

@@ -82,7 +82,7 @@ def _bent(mesh: TriMesh, radius_m: float, edge_m: float) -> TriMesh:
 
 
 def divided(mesh: TriMesh, edge_m: float) -> TriMesh:
-    """The same surface with no edge that runs further than `edge_m` along x; closed where it was closed.
+    """Return the same surface with no edge that runs further than `edge_m` along x; closed where it was closed.
 
     Every edge that is too long is halved, for both of its triangles alike, and each triangle is cut anew.
     """
@@ -158,7 +158,7 @@ class WeldPart(Protocol):
         """Where the centre of the loaded tip rests, from the root."""
 
     def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
-        """How hard the tip is pressed; a value that is given is kept."""
+        """Return how deep the tip is pressed; a given value is used as it is."""
 
     def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the joint in which it then rests."""
@@ -251,7 +251,7 @@ class Part:
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
     def felt_by(self, tip: SeatedTip) -> bool:
-        """Whether the tip is used on this seam.
+        """Return whether the tip is used on this seam.
 
         As the seam's `feel` says, else not where level plates leave too narrow a gap.
         """
@@ -293,7 +293,7 @@ class Part:
 
 
 def feels(section: JointSection, tip: SeatedTip) -> bool:
-    """Whether a ball can feel a joint."""
+    """Return whether a ball can feel a joint."""
     try:
         check_weldable(section, tip.tip_radius_m)
         press_for(section, tip)
@@ -303,7 +303,7 @@ def feels(section: JointSection, tip: SeatedTip) -> bool:
 
 
 def is_felt(part: WeldPart, tip: SeatedTip) -> bool:
-    """Whether the tip is used on the part's seam; on a grooved plate it is."""
+    """Return whether the tip is used on the part's seam; on a grooved plate it is."""
     return not isinstance(part, Part) or part.felt_by(tip)
 
 
@@ -313,7 +313,7 @@ def seam_count(part: WeldPart) -> int:
 
 
 def numbered(part: WeldPart, seam: int) -> WeldPart:
-    """The part with its seam of this number, counted from 0 in the order of welding; a plate has one."""
+    """Return the part with its seam of this number, counted from 0 in the order of welding; a plate has one."""
     if not isinstance(part, Part) or seam == 0:
         return part
     seams = (part.seam, *part.others)
@@ -321,7 +321,7 @@ def numbered(part: WeldPart, seam: int) -> WeldPart:
 
 
 def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
-    """The triangles of a mesh whose boxes come within reach of a line (N,3)."""
+    """Return the triangles of a mesh whose boxes come within reach of a line (N,3)."""
     corners = mesh.vertices[mesh.triangles]
     low, high = corners.min(axis=1) - reach_m, corners.max(axis=1) + reach_m
     near = np.zeros(len(corners), dtype=bool)
@@ -332,7 +332,7 @@ def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
 
 
 def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
-    """The part as made, bowed by an amplitude at its middle in a direction (3,).
+    """Return the part as made, bowed by an amplitude at its middle in a direction (3,).
 
     Its seam is not where the drawing has it.
 
@@ -362,7 +362,7 @@ def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
 
 
 def _moved_seam(s: DrawnSeam, moved: Callable[[Floats], Floats]) -> DrawnSeam:
-    """The seam on a moved surface, its directions square to it."""
+    """Return the seam on a moved surface, its directions square to it."""
     points = moved(s.points_P)
     t = np.gradient(points, axis=0)
     t /= np.linalg.norm(t, axis=1, keepdims=True)
@@ -377,7 +377,7 @@ def _moved_seam(s: DrawnSeam, moved: Callable[[Floats], Floats]) -> DrawnSeam:
 
 
 def _divided_along(mesh: TriMesh, e: Floats, edge_m: float) -> TriMesh:
-    """The same surface with no edge that runs further than `edge_m` along a unit vector."""
+    """Return the same surface with no edge that runs further than `edge_m` along a unit vector."""
     helper = np.array([0.0, 0.0, 1.0]) if abs(e[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     y = np.cross(helper, e)
     y /= np.linalg.norm(y)

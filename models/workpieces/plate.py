@@ -75,7 +75,7 @@ class PlanarPath:
         return points + left_m * np.column_stack([-np.sin(heading), np.cos(heading)])
 
     def moved(self, x: float, y: float, yaw: float) -> PlanarPath:
-        """The same path in a frame in which its own frame stands at (x, y) turned by yaw."""
+        """Return the same path in a frame in which its own frame is at (x, y), turned by yaw."""
         x0, y0, heading = self.start
         c, s = math.cos(yaw), math.sin(yaw)
         return replace(self, start=(x + c * x0 - s * y0, y + s * x0 + c * y0, heading + yaw))
@@ -141,7 +141,7 @@ class Workpiece:
         return JointSection(self.half_angle_rad, wall, wall)
 
     def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
-        """How hard the tip is pressed into the groove, m; a value that is given is kept."""
+        """Return how deep the tip is pressed into the groove, m; a given value is used as it is."""
         return Press(PRESS_AXIAL_M if axial_m is None else axial_m, PRESS_LATERAL_M if lateral_m is None else lateral_m)
 
     def seated(self, tip: SeatedTip, press: Press) -> Seated:
@@ -244,7 +244,7 @@ def make_workpiece(
 def _drawing(
     shape: str, length: float, radius: float | None, width: float | None, thickness: float
 ) -> tuple[PlanarPath, tuple[float, float, float], float]:
-    """The seam's path in P, the plate's size and the corner radius, as drawn."""
+    """Return the seam's path in P, the plate's size and the corner radius, as drawn."""
     if shape == "straight":
         return PlanarPath((-0.5 * length, 0.0, 0.0), ((length, 0.0),)), (length, width or 0.200, thickness), math.inf
     if shape == "s":
@@ -325,7 +325,7 @@ def _groove_solid(
     radius: float,
     spacing: float,
 ) -> TriMesh:
-    """The walls with a band of top face and a body below, closed; long triangles where the seam is straight."""
+    """Return the walls with a band of top face and a body below, closed; long triangles where the seam is straight."""
     band = half_width + min(GROOVE_BAND_M, 0.8 * (radius - half_width))
     floor = -0.5 * (depth + thickness)
     columns = np.array([band, half_width, 0.0, -half_width, -band, -band, band])

@@ -50,7 +50,7 @@ class SeamSource:
 
 
 def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
-    """The seam on the part.
+    """Return the seam on the part.
 
     Raises:
         InputError: a file that cannot be read, edges that do not follow each other, a joint that is not there.

@@ -89,7 +89,7 @@ class DrawnSeam:
         return np.asarray(np.pi - np.arccos(cos))
 
     def transformed(self, X: RigidTransform) -> DrawnSeam:
-        """The same seam expressed through X (of P into B for X = X_BP)."""
+        """Return the same seam expressed through X (of P into B for X = X_BP)."""
         R = X.rotation().matrix()
         return replace(
             self,
@@ -100,7 +100,7 @@ class DrawnSeam:
         )
 
     def between(self, start_m: float, end_m: float) -> DrawnSeam:
-        """The stretch between two arc lengths, m; a closed seam goes on beyond its end, over its start.
+        """Return the stretch between two arc lengths, m; a closed seam goes on beyond its end, over its start.
 
         Raises:
             InputError: less than four points are left.
@@ -125,7 +125,7 @@ class DrawnSeam:
         )
 
     def reversed(self) -> DrawnSeam:
-        """The same seam travelled the other way: left and right change places."""
+        """Return the same seam in the opposite direction: left and right change places."""
         return replace(
             self,
             points_P=self.points_P[::-1],

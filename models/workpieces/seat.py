@@ -130,8 +130,8 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
         sinks = r - math.sqrt(r**2 - 0.25 * section.gap_m**2)
         if min(section.left_m, section.right_m) < sinks + MARGIN_M:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm stands on the ground: the plates are thinner than the"
-                f" {mm * sinks:.2g} mm that it sinks into a gap of {mm * section.gap_m:.3g} mm."
+                f"A tip of radius {mm * r:.3g} mm sinks {mm * sinks:.2g} mm into a gap of {mm * section.gap_m:.3g} mm"
+                " and touches the ground, because the plates are thinner. Use a larger tip or a narrower gap."
             )
     elif section.half_angle_rad > 0.5 * math.radians(176.0):
         raise JointNotWeldable("The plates meet without a gap: there is nothing the tip could feel; leave a gap.")
@@ -161,9 +161,9 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
 def press_for(
     section: JointSection, tip: SeatedTip, axial_m: float | None = None, lateral_m: float | None = None
 ) -> Press:
-    """How hard the tip is pressed into this joint, m; a value that is given is kept.
+    """Return how deep the tip is pressed into this joint, m; a given value is used as it is.
 
-    Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall; half of that is
+    Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall. Half of that is
     taken, at most 2 mm, and in wide joints the downward press is increased.
 
     Raises:
@@ -187,7 +187,7 @@ def press_for(
         )
     if lateral < LEAST_LEAN_M:
         raise JointNotWeldable(
-            f"The tip could lean only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out, which"
+            f"The tip can press only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out. That"
             " is too little to be felt: use a smaller tip or a wider gap."
         )
     return Press(axial, lateral)
@@ -197,7 +197,7 @@ def seat(section: JointSection, tip: SeatedTip, press: Press) -> Seated:
     """Where the ball of the tip rests, pressed left and down by its springs.
 
     The pressure in the soft ball grows linearly from its surface to the modulus at its centre (Elandt et al., IROS
-    2019); each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
+    2019). Each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
 
     Raises:
         JointNotWeldable: no such place: the ball climbs out.
@@ -223,7 +223,7 @@ def face_forces(centre: Floats, segments: Floats, normals: Floats, radius_m: flo
     """Force (2,) N of rigid faces (M,2,2), long along the seam, on a soft ball at a point (2,) of the cut.
 
     A strip of a face at distance p from the centre meets the ball over 2 l, l^2 = r^2 - p^2, with the pressure
-    E (1 - sqrt(p^2 + z^2) / r); its integral over z is E (l - p^2 asinh(l / p) / r).
+    E (1 - sqrt(p^2 + z^2) / r). Its integral over z is E (l - p^2 asinh(l / p) / r).
     """
     a, d = segments[:, 0] - centre, segments[:, 1] - segments[:, 0]
     length = np.linalg.norm(d, axis=1)

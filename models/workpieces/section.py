@@ -35,13 +35,13 @@ class Section:
     up: Floats
 
     def space(self, v: Floats) -> Floats:
-        """A vector (2,) of the cut as a vector (3,) of the part's frame."""
+        """Return a vector (2,) of the cut as a vector (3,) of the part's frame."""
         return np.asarray(v[0] * self.right + v[1] * self.up)
 
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The free space between two walls, seen from one point of a cut.
+    """Describe the free space between two walls, from one point of a cut.
 
     Angles from x towards y, rad, and the walls' normals.
     """
@@ -134,7 +134,7 @@ def crossings(section: Section, radius: float) -> tuple[Floats, Floats, Floats, 
 
 
 def openings(section: Section, radius: float) -> list[Opening]:
-    """Every free space about the seam's point of the cut, between walls met at this distance.
+    """Return every free space about the seam's point of the cut, between walls met at this distance.
 
     Material is counted by its surfaces, so bodies may touch or overlap: between two bodies' common faces nothing is
     free.

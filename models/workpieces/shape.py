@@ -88,7 +88,7 @@ class PartShape:
     joints: tuple[PartJoint, ...] = ()
 
     def edge(self, id: int) -> PartEdge:
-        """The edge with this number.
+        """Return the edge with this number.
 
         Raises:
             InputError: there is none.

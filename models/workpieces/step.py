@@ -53,7 +53,7 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
 
 
 def referenced(path: Path) -> list[Path]:
-    """The STEP files beside a part's file from which it takes bodies, by its own and their external references.
+    """Return the STEP files beside a part's file from which it takes bodies, by its own and their external references.
 
     Raises:
         InputError: one of them is not there.
@@ -100,7 +100,7 @@ def _check_text(path: Path) -> None:
 
 
 def _transferred(path: Path) -> tuple[Any, str | None]:
-    """The TopoDS_Shape in millimetres and the file's length unit (None where it is another than mm, m, inch)."""
+    """Return the TopoDS_Shape in millimetres and the file's length unit (None where it is another than mm, m, inch)."""
     try:
         from OCP.collections import Sequence_TCollection_AsciiString
         from OCP.IFSelect import IFSelect_ReturnStatus
@@ -136,7 +136,7 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
 
 
 def _assembled(path: Path) -> Any:
-    """The shape of an assembly whose bodies are in other files, in millimetres."""
+    """Return the shape of an assembly whose bodies are in other files, in millimetres."""
     from OCP.STEPCAFControl import STEPCAFControl_Reader
     from OCP.TCollection import TCollection_ExtendedString
     from OCP.TDocStd import TDocStd_Document
@@ -150,7 +150,7 @@ def _assembled(path: Path) -> Any:
 
 
 def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
-    """The fine mesh of all solids, m, and their number."""
+    """Return the fine mesh of all solids, m, and their number."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
@@ -184,7 +184,7 @@ def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
 
 
 def _edges(shape: Any) -> tuple[PartEdge, ...]:
-    """Every edge of the shape, numbered in the file's order; edges within one smooth face are left out."""
+    """Return every edge of the shape, numbered in the file's order; edges within one smooth face are left out."""
     from OCP.BRepAdaptor import BRepAdaptor_Curve
     from OCP.GeomAbs import GeomAbs_CurveType
     from OCP.TopAbs import TopAbs_ShapeEnum
@@ -261,7 +261,7 @@ def with_joints(
 
 
 def _is(edge: PartEdge, line: Floats) -> bool:
-    """Whether an edge is this line (N,3) m."""
+    """Return whether an edge is this line (N,3) m."""
     from weldcal.models.workpieces.brep import length_of
 
     p, q = edge.points_P, line

@@ -64,7 +64,7 @@ def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
 
 
 def drake_shape(shape: ToolShape) -> Shape:
-    """A tool's shape for Drake."""
+    """Return a tool's shape for Drake."""
     if shape.kind == "mesh":
         return mesh_shape(shape_mesh(shape), "tool.obj")
     kinds: dict[str, type[Shape]] = {"box": Box, "cylinder": Cylinder, "capsule": Capsule, "sphere": Sphere}
@@ -93,12 +93,12 @@ def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> N
 
 
 def tool_tag(tool: WeldingTool) -> TagModel:
-    """The tag that the tool carries."""
+    """Return the tag that the tool carries."""
     return TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
 
 
 def printed_tag(tag: TagModel) -> tuple[NDArray[np.uint8], float]:
-    """The print (n, n) of a tag with a white margin of one cell, blurred as by a lens, and its side in m."""
+    """Return the print (n, n) of a tag with a white margin of one cell, blurred as by a lens, and its side in m."""
     cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
     sharp = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
     print_ = np.asarray(cv2.GaussianBlur(sharp, (0, 0), BLUR_TEXELS), dtype=np.uint8)

@@ -18,7 +18,7 @@ ENTRY_POINTS = "weldcal.drivers"
 
 @cache
 def plugins() -> tuple[ModuleType, ...]:
-    """The modules that installed packages register in the entry-point group weldcal.drivers.
+    """Return the modules that installed packages register in the entry-point group weldcal.drivers.
 
     Raises:
         InputError: one of them cannot be imported; the message names its package.
@@ -38,7 +38,7 @@ def plugins() -> tuple[ModuleType, ...]:
 
 @cache
 def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
-    """The configuration classes of all drivers of a device, its default first.
+    """Return the configuration classes of all drivers of a device, its default first.
 
     Raises:
         InputError: two drivers have the same name.
@@ -58,13 +58,13 @@ def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
 
 
 def default_config(device: str) -> DriverConfig:
-    """The default configuration of a device, used where a scenario does not name it."""
+    """Return the default configuration of a device, used where a scenario does not name it."""
     return driver_configs(device)[0]()
 
 
 @cache
 def _own_modules() -> tuple[ModuleType, ...]:
-    """The modules of drivers/<backend>/ that define ApplyDriverConfig; helper modules are not imported."""
+    """Return the modules of drivers/<backend>/ that define ApplyDriverConfig; helper modules are not imported."""
     names = []
     for finder, name, is_package in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + "."):
         spec = None if is_package else finder.find_spec(name, None)
@@ -74,7 +74,7 @@ def _own_modules() -> tuple[ModuleType, ...]:
 
 
 def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:
-    """The configuration classes that a module itself defines, with their field types resolved to objects."""
+    """Return the configuration classes that a module itself defines, with their field types resolved to objects."""
     found: list[type[DriverConfig]] = []
     for member in vars(module).values():
         if not (inspect.isclass(member) and issubclass(member, DriverConfig) and member.__module__ == module.__name__):

@@ -52,7 +52,7 @@ class PreparedRobot:
         return None if self.clock is None else self.clock.pace
 
     def rest(self) -> None:
-        """Keep the arm at rest while the Diagram stands, with the handle's `rest` where it has one."""
+        """Keep the arm at rest while the Diagram is paused, with the handle's `rest` where it has one."""
         if (rest := getattr(self.handle, "rest", None)) is not None:
             rest()
 
@@ -107,11 +107,11 @@ class StationBuild:
         return system
 
     def find(self, kind: type[Part]) -> Part | None:
-        """The part of this type; None where the station has none."""
+        """Return the part of this type; None where the station has none."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
     def require(self, kind: type[Part]) -> Part:
-        """The part of this type; raises RuntimeError where the station has none."""
+        """Return the part of this type; raises RuntimeError where the station has none."""
         found = self.find(kind)
         if found is None:
             raise RuntimeError(f"this driver needs a {kind.__name__} in the station")

@@ -32,23 +32,23 @@ MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 @dataclass(eq=False, kw_only=True)
 class AddedJob(ABC):
-    """A job's systems in a cell, as seen by the run loop, the reports and the tests."""
+    """Give the run loop, the reports and the tests access to a job's systems in a cell."""
 
     ports: JobPorts
     maximum_time_s: float  # the job holds itself after this time
 
     def command(self, root: Context) -> JobCommand:
-        """The job's command to the first arm; `root` is a context of the whole Diagram."""
+        """Return the job's command to the first arm; `root` is a context of the whole Diagram."""
         found: JobCommand = self.value(self.ports.commands[0], root)
         return found
 
     def state(self, root: Context) -> Any:
-        """The job's state; `root` is a context of the whole Diagram."""
+        """Return the job's state; `root` is a context of the whole Diagram."""
         return self.value(self.ports.state, root)
 
     @staticmethod
     def value(port: OutputPort, root: Context) -> Any:
-        """The value of an output port; `root` is a context of the whole Diagram."""
+        """Return the value of an output port; `root` is a context of the whole Diagram."""
         return port.Eval(port.get_system().GetMyContextFromRoot(root))
 
     def view(self) -> tuple[Array, Array]:
@@ -56,7 +56,7 @@ class AddedJob(ABC):
         return np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42])
 
     def can_stand(self, root: Context) -> bool:
-        """Whether the Diagram's time may stand still now.
+        """Return whether the Diagram's time may stand still now.
 
         Where an operator holds a job that has motion of its own, it rests first.
         """
@@ -64,7 +64,7 @@ class AddedJob(ABC):
 
     @abstractmethod
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
-        """The present step as text, and the completed share of the run.
+        """Return the present step as text, and the completed share of the run.
 
         `phases`: started phases as name, simulated s, wall s.
         """
@@ -85,11 +85,11 @@ class Job(ABC, Generic[PlanOf]):
     def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> WorldSetup:
-        """The objects that the job adds to a simulated world, besides the true workpiece `part` at X_BP."""
+        """Return the objects that the job adds to a simulated world, besides the true workpiece `part` at X_BP."""
         return WorldSetup()
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
-        """A system between the simulated arm and the readers of its joints (see add_spine), or None."""
+        """Return a system between the simulated arm and the readers of its joints (see add_spine), or None."""
         return None
 
     @abstractmethod
@@ -103,7 +103,7 @@ class Job(ABC, Generic[PlanOf]):
 
 @cache
 def jobs() -> tuple[Job[Any], ...]:
-    """All jobs, sorted by key; the job without a key is the last."""
+    """Return all jobs, sorted by key; the job without a key is the last."""
     names = [info.name for info in pkgutil.iter_modules(rooms.__path__, rooms.__name__ + ".") if info.ispkg]
     modules = [importlib.import_module(f"{name}.{MODULE}") for name in names]
     found = [module.JOB for module in (*modules, *plugins()) if hasattr(module, "JOB")]
@@ -111,7 +111,7 @@ def jobs() -> tuple[Job[Any], ...]:
 
 
 def job_of(scenario: Scenario) -> Job[Any]:
-    """The job of a scenario: the one whose part the scenario contains, else the job without a key.
+    """Return the job of a scenario: the one whose part the scenario contains, else the job without a key.
 
     Raises:
         InputError: the scenario has the parts of two jobs.

@@ -176,7 +176,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
             self._ports[name] = (port, value if name in optional else None)
 
     def ports(self, arms: int = 1, **more: Any) -> JobPorts:
-        """The ports that the spine connects, of a job with so many arms; `more` as in JobPorts."""
+        """Return the ports that the spine connects, of a job with so many arms; `more` as in JobPorts."""
         return JobPorts(
             commands=tuple(self.GetOutputPort(name) for name in self.commands[:arms]),
             state=self.GetOutputPort(self.state_port),
@@ -190,7 +190,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return state
 
     def look(self, context: Context, s: StateOf) -> InputsOf:
-        """The inputs at this tick; a job may add to them."""
+        """Return the inputs at this tick; a job may add to them."""
         further: dict[str, Any] = {}
         for name, (port, otherwise) in self._ports.items():
             if otherwise is not None and not port.HasValue(context):
@@ -209,7 +209,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return found
 
     def next_state(self, s: StateOf, now: InputsOf) -> StateOf:
-        """The state after one tick; the same object where nothing changed. `done` and `held` are final."""
+        """Return the state after one tick; the same object where nothing changed. `done` and `held` are final."""
         if s.finished:
             return s
         if reason := self._why_stop(s, now):
@@ -231,15 +231,15 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return s
 
     def drive(self, s: StateOf, now: InputsOf) -> tuple[StateOf, Array]:
-        """The state, and the arm's joint velocity (6,) rad/s, in a phase of `driven`; see `guarded`."""
+        """Return the state, and the arm's joint velocity (6,) rad/s, in a phase of `driven`; see `guarded`."""
         raise NotImplementedError
 
     def where(self, s: StateOf) -> str:
-        """The phase as a reason names it."""
+        """Return the phase as a reason names it."""
         return s.phase
 
     def command(self, s: StateOf, arm: int = 0) -> JobCommand:
-        """The command to an arm, by its number."""
+        """Return the command to an arm, by its number."""
         return JobCommand(
             phase=s.phase,
             mode="move" if s.phase in self.moves else "weld" if s.phase in self.driven else "hold",
@@ -256,27 +256,27 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return s.phase in self.flags[name]
 
     def enter(self, s: StateOf, now: InputsOf, phase: str, **changes: Any) -> StateOf:
-        """The state at the start of a phase."""
+        """Return the state at the start of a phase."""
         return replace(s, phase=phase, since=now.time, settled_since=None, slowed="", **changes)
 
     def go(self, s: StateOf, now: InputsOf, phase: str, q_goal: Array | None, **changes: Any) -> StateOf:
-        """The state at the start of a move."""
+        """Return the state at the start of a move."""
         return self.enter(s, now, phase, goal_id=s.goal_id + 1, q_goal=q_goal, **changes)
 
     def request(self, s: StateOf, now: InputsOf, phase: str, **changes: Any) -> StateOf:
-        """The state at the start of a phase that waits for a scan or a picture."""
+        """Return the state at the start of a phase that waits for a scan or a picture."""
         return self.enter(s, now, phase, trigger=s.trigger + 1, **changes)
 
     def end(self, s: StateOf, now: InputsOf) -> StateOf:
-        """The state at the end: held where a reason was found on the way, else done."""
+        """Return the state at the end: held where a reason was found during the procedure, else done."""
         return self.enter(s, now, "held" if s.reason else "done")
 
     def held(self, s: StateOf, now: InputsOf, reason: str) -> StateOf:
-        """The state in which the arm stays at rest and the process off; only a new job leaves it."""
+        """Return the state in which the arm stays at rest and the process off; only a new job leaves it."""
         return self.enter(s, now, "held", reason=self.because(s, reason))
 
     def because(self, s: StateOf, reason: str) -> str:
-        """A reason, with the guard's sentence where the arm was slowed in this phase."""
+        """Return a reason, with the guard's sentence where the arm was slowed in this phase."""
         return f"{reason} {s.slowed}" if s.slowed else reason
 
     def guarded(self, s: StateOf, now: InputsOf, arm: ArmModel, p_FP: Array, V: Array) -> tuple[StateOf, Array]:
@@ -301,7 +301,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return (s if s.slowed else replace(s, slowed=SLOWED)), found.q_dot
 
     def watched(self, s: StateOf, now: InputsOf, arm: ArmModel, p_FP: Array, q_dot: Array) -> tuple[StateOf, Array]:
-        """A joint velocity (6,) rad/s along a planned path.
+        """Return a joint velocity (6,) rad/s along a planned path.
 
         Its time is fixed: the guard holds it and does not slow it.
         """

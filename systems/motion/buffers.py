@@ -89,7 +89,7 @@ class Queue(Message):
 
 
 def advance(queue: Queue, arrived: tuple[StreamedScan, ...], done: int, capacity: int) -> Queue:
-    """The queue after frames arrived and the reader finished those up to number ``done``.
+    """Return the queue after frames arrived and the reader finished those up to number ``done``.
 
     A frame that never came counts as dropped, too.
     """

@@ -16,7 +16,7 @@ AT_HOME_RAD = 0.01  # within this distance of home the job starts without a move
 
 
 def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
-    """Whether each joint (6,) rad is within AT_HOME_RAD of home."""
+    """Return whether each joint (6,) rad is within AT_HOME_RAD of home."""
     return bool(np.max(np.abs(q - q_home)) <= AT_HOME_RAD)
 
 
@@ -24,7 +24,7 @@ Joints = NDArray[np.float64]
 
 
 def station_bodies(station: Station) -> list[LinkCapsule]:
-    """The bodies of the clearance checks: the arm's links and its tool."""
+    """Return the bodies of the clearance checks: the arm's links and its tool."""
     return arm_bodies(station.arm, () if station.tool is None else station.tool.capsules())
 
 
@@ -53,15 +53,15 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the"
-        f" surroundings or the arm itself: move it by hand near home_deg [{wanted}] first."
+        f"The arm is at [{stands}] deg. From there a straight joint move to home would touch the table, the"
+        f" surroundings or the arm itself. Move the arm by hand near home_deg [{wanted}] first."
     )
 
 
 def clear_poses(
     scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[LinkCapsule]
 ) -> tuple[PlannedPose, ...]:
-    """The poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
+    """Return the poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
 
     Raises:
         UnreachableScanner: too many moves would touch the table, the surroundings or the arm itself.

@@ -53,7 +53,7 @@ class RunClock:
     late_since: float | None = None
 
     def time(self, device_s: float) -> float:
-        """A device time on the robot's clock, s."""
+        """Return a device time on the robot's clock, s."""
         return self.robot_s + self.rate * (device_s - self.device_s)
 
 
@@ -71,7 +71,7 @@ class Seen:
     history: PoseHistory
 
     def features(self, times: Array) -> Array:
-        """The feature in the base by the robot (..., 3) m at times (...) s; NaN outside the history."""
+        """Return the feature in the base by the robot (..., 3) m at times (...) s; NaN outside the history."""
         t, q = self.history.times, self.history.positions
         if t.size < 2:
             return np.full((*times.shape, 3), np.nan)
@@ -112,7 +112,7 @@ def followed(
 
 
 def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:
-    """The clock after a frame with a fit, and the frames that can be used now.
+    """Return the clock after a frame with a fit, and the frames that can be used now.
 
     At rest each at once, because no time is wrong there; in motion those that waited, once they show the clock. One
     that has left the history is given up. By a clock that is learnt only a very late frame waits, for the next: then it
@@ -192,7 +192,7 @@ class MonitoredCalibration:
 
     @staticmethod
     def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
-        """The monitored calibration of a result.
+        """Return the monitored calibration of a result.
 
         ``delay_s`` is the usual delay of the scanner, where the result does not know its clock.
         """
@@ -205,7 +205,7 @@ class MonitoredCalibration:
 
     @staticmethod
     def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> "MonitoredCalibration | None":
-        """The calibration that a run has made; None until it is done."""
+        """Return the calibration that a run has made; None until it is done."""
         e = status.estimate
         if e is None or not status.done:
             return None
@@ -312,7 +312,7 @@ class DriftMonitor(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def status(self, context: Context) -> DriftStatus:
-        """The status in this system's context."""
+        """Return the status in this system's context."""
         watch: _Watch = context.get_abstract_state(self._state).get_value()
         return watch.status
 
@@ -341,7 +341,7 @@ class DriftMonitor(LeafSystem):
 
 
 def _begun(calibration: MonitoredCalibration | None) -> _Watch:
-    """The watch of a calibration before its first frame."""
+    """Return the watch of a calibration before its first frame."""
     if calibration is None:
         return _Watch()
     return _Watch(DriftStatus(X_BC=calibration.X_BC, covariance=calibration.covariance), watched=calibration)
@@ -376,7 +376,7 @@ def watched_frame(
 
 
 def _tested(watch: _Watch, c: MonitoredCalibration, frames: list[TrackedFrame], config: DriftConfig | None) -> _Watch:
-    """The watch after these frames' test."""
+    """Return the watch after these frames' test."""
     pivot = frames[0].p_BR if watch.pivot is None else watch.pivot
     test = (
         DriftTest(c.X_BC, c.covariance, pivot, c.config or config) if watch.test is None else copy.deepcopy(watch.test)
@@ -403,7 +403,7 @@ def _tested(watch: _Watch, c: MonitoredCalibration, frames: list[TrackedFrame], 
 
 
 def recalibrated(watch: _Watch) -> _Watch:
-    """The watch of the pose that the frames since the last change show; events and alarms are cleared."""
+    """Return the watch of the pose that the frames since the last change show; events and alarms are cleared."""
     status, c = watch.status, watch.watched
     if c is None or status.X_BC is None or status.covariance is None or status.alarmed:
         return watch  # a change that is still being measured is no pose to go on with
@@ -420,7 +420,7 @@ def _tracked(
     X_FR: RigidTransform,
     clock: RunClock | None,
 ) -> TrackedFrame | None:
-    """A frame with the feature's pose and rates at its capture; None where one of them is missing."""
+    """Return a frame with the feature's pose and rates at its capture; None where one of them is missing."""
     fit = estimate.fit
     if fit is None:
         return None

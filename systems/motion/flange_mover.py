@@ -61,7 +61,7 @@ class FlangeMover(LeafSystem):
         - velocity
         - settled_goal
 
-    `velocity` (6) rad/s; `settled_goal` (1) is the id of the newest goal at which the arm has come to rest: by its
+    `velocity` (6) rad/s. `settled_goal` (1) is the id of the newest goal at which the arm has come to rest: by its
     measured velocity, or, where that is noisier than SETTLED_RAD_S, by how little the joints have turned in
     REST_WINDOW_S. The path is straight in joint space: every goal of the cell is a checked configuration, and the
     channel is joint velocity.

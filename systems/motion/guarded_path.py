@@ -36,7 +36,7 @@ class SingularityGuard(LeafSystem):
         - velocity
         - margin
 
-    `V_BT` (6) [omega rad/s; v m/s] in B; `guarded` (8) is both of the following; `velocity` (6) rad/s; `margin` (2):
+    `V_BT` (6) [omega rad/s; v m/s] in B. `guarded` (8) is both of the following. `velocity` (6) rad/s. `margin` (2):
     least singular value of the length-scaled Jacobian, and 1.0 while the arm is stopped. The seam's own singularity
     (n_d . n_t -> 0) is guarded inside the servo.
     """
@@ -80,7 +80,7 @@ class InfeasiblePath(WeldcalError):
         self.problem = problem
 
     def advised(self, advice: str) -> "InfeasiblePath":
-        """The same with other advice."""
+        """Return the same with other advice."""
         return type(self)(self.problem, advice)
 
 
@@ -124,7 +124,7 @@ class Followed(NamedTuple):
 def straight(
     name: str, X_BT: RigidTransform, way: Array, speed_m_s: float, X_FT: RigidTransform, least_share: float = 0.25
 ) -> GuardedMotion:
-    """A motion from X_BT along `way` (3,) m; a descent, which may be slowed more than a weld."""
+    """Return a motion from X_BT along `way` (3,) m; a descent, which may be slowed more than a weld."""
     length = float(np.linalg.norm(way))
     share = np.linspace(0.0, 1.0, max(2, round(length / EVERY_M) + 1))
     poses = [RigidTransform(X_BT.rotation(), X_BT.translation() + u * way) for u in share]
@@ -164,7 +164,7 @@ def check_joints(arm: ArmModel, q: Array, where: str) -> None:
 
 
 def joint_name(arm: ArmModel, k: int) -> str:
-    """A joint's name in a sentence."""
+    """Return a joint's name in a sentence."""
     return arm.joint_names[k].removesuffix("_joint").replace("_", " ")
 
 
@@ -215,7 +215,7 @@ def _follow(arm: ArmModel, q: Array, motion: GuardedMotion) -> Followed:
 
 
 def _places(p: Array, R: Array) -> list[int]:
-    """The poses to check: the first, the last, and every EVERY_M or EVERY_RAD between them."""
+    """Return the poses to check: the first, the last, and every EVERY_M or EVERY_RAD between them."""
     turn = np.linalg.norm(np.diff(R, axis=0), axis=(1, 2)) / np.sqrt(2.0)
     way = np.linalg.norm(np.diff(p, axis=0), axis=1) / EVERY_M + turn / EVERY_RAD
     steps = np.floor(np.r_[0.0, np.cumsum(way)])

@@ -99,7 +99,7 @@ class ProcessSwitch(LeafSystem):
     `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the
     arm; `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through
     the arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to
-    stop. A burning torch that the robot's status or the guard turned off stays off for the rest of that weld; after a
+    stop. A burning torch that the robot's status or the guard turned off stays off for the rest of that weld. After a
     operator's hold the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned
     it off; the JobSequencer then holds the job.
     """
@@ -122,7 +122,7 @@ class ProcessSwitch(LeafSystem):
         return bool(self._margin.Eval(context)[1] > 0.5)
 
     def _free(self, context: Context) -> bool:
-        """Whether robot and guard both allow the process."""
+        """Return whether robot and guard both allow the process."""
         return bool(self._status.Eval(context).ready and not self._stopped(context))
 
     def _latch(self, context: Context, discrete: DiscreteValues) -> None:

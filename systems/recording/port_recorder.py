@@ -120,5 +120,5 @@ class PortRecorder(LeafSystem):
 
 
 def _both_empty(value: Any, last: Any) -> bool:
-    """Whether both are messages from before the first, which a sensor may make anew each time."""
+    """Return whether both are messages from before the first, which a sensor may make anew each time."""
     return getattr(value, "sequence", 1) == 0 and getattr(last, "sequence", 1) == 0 and type(value) is type(last)

@@ -180,7 +180,7 @@ def _add(rising: dict[str, tuple[list[int], list[Any]]], port: str, key: int, va
 
 
 def _played(kind: str, value: dict[str, Any], body: np.ndarray | None) -> Any:
-    """The message of a port from its JSON and the cloud or image before it."""
+    """Return the message of a port from its JSON and the cloud or image before it."""
     if kind == "ndarray":  # a pose
         return RigidTransform(array(value))
     if kind not in _PLAYED:
@@ -215,7 +215,7 @@ class Difference:
     now: Any
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         return {"name": self.name, "time_s": self.time_s, "message": self.message, "was": self.was, "now": self.now}
 
 

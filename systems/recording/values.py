@@ -128,7 +128,7 @@ def _array(value: np.ndarray, largest: int | None = None) -> Any:
 
 
 def decode(value: Any, kind: Any) -> Any:
-    """The value of a type hint from what `encode` wrote.
+    """Return the value of a type hint from what `encode` wrote.
 
     Raises:
         InputError: the value is not of this type.
@@ -172,7 +172,7 @@ def _decode(value: Any, kind: Any) -> Any:
 
 
 def array(value: Any) -> np.ndarray:
-    """The array that `encode` wrote; read-only."""
+    """Return the array that `encode` wrote; read-only."""
     if isinstance(value, list):
         found = np.array([_NOT_FINITE[x] if isinstance(x, str) else x for x in value], dtype=np.float64)
     elif "values" in value:
@@ -264,7 +264,7 @@ class _In:
 
 
 def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytearray:
-    """An organised cloud (H, W, 3), NaN where there is no point, as sensor_msgs/msg/PointCloud2.
+    """Return an organised cloud (H, W, 3), NaN where there is no point, as sensor_msgs/msg/PointCloud2.
 
     The numbers are float32 or float64.
     """
@@ -288,7 +288,7 @@ def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytearray:
 
 
 def read_cloud(data: bytes) -> np.ndarray:
-    """The cloud that write_cloud wrote; read-only."""
+    """Return the cloud that write_cloud wrote; read-only."""
     given = _In(data)
     given.header()
     height, width = given.number("I"), given.number("I")
@@ -306,7 +306,7 @@ def read_cloud(data: bytes) -> np.ndarray:
 
 
 def write_image(pixels: np.ndarray, time_ns: int, frame: str) -> bytearray:
-    """A grey image (H, W) uint8 as sensor_msgs/msg/Image, mono8."""
+    """Return a grey image (H, W) uint8 as sensor_msgs/msg/Image, mono8."""
     out = _Out()
     out.header(time_ns, frame)
     out.number("I", pixels.shape[0])
@@ -319,7 +319,7 @@ def write_image(pixels: np.ndarray, time_ns: int, frame: str) -> bytearray:
 
 
 def read_image(data: bytes) -> np.ndarray:
-    """The image that write_image wrote; read-only."""
+    """Return the image that write_image wrote; read-only."""
     given = _In(data)
     given.header()
     height, width = given.number("I"), given.number("I")

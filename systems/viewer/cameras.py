@@ -51,7 +51,7 @@ _PLACES = 40  # remembered: a browser answers late
 
 
 class CameraPlace(NamedTuple):
-    """From `time` s on camera `view` stands at `eye` and looks at `target`, (3,) m in the world."""
+    """Place camera `view` at `eye`, looking at `target`, (3,) m in the world, from `time` s on."""
 
     time: float
     view: str
@@ -145,7 +145,7 @@ class CameraDirector(LeafSystem):
         self._last, self._views.showing = (view, eye, target), view
 
     def _report(self) -> Array | None:
-        """The camera (3,) m of the browser that changed last.
+        """Return the camera (3,) m of the browser that changed last.
 
         None where no browser has reported since the last call.
         """
@@ -159,11 +159,11 @@ class CameraDirector(LeafSystem):
         return p
 
     def _moved(self, p: Array) -> bool:
-        """Whether the camera at `p` (3,) m is neither where one was put nor where a page begins."""
+        """Return whether the camera at `p` (3,) m is neither where one was put nor where a page begins."""
         return bool(self._put) and float(np.linalg.norm([*self._put, *START_M] - p, axis=1).min()) > MOVED_M
 
     def _reloaded(self, p: Array) -> bool:
-        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it.
+        """Return whether the only browser shows a camera at `p` (3,) m that Meshcat gave it.
 
         Its page was reloaded after it was moved.
         """

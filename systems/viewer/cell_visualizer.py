@@ -141,7 +141,7 @@ class CellVisualizer(LeafSystem):
         self._meshcat.SetTransform(path, RigidTransform(R_SIGN, p_B))
 
     def _beside(self, X_BC: RigidTransform, up_m: float) -> Array:
-        """Where the sign of a camera stands: beside its axes, off the housing."""
+        """Return where the sign of a camera is: beside its axes, off the housing."""
         return np.asarray(X_BC.translation() + np.array([0.0, 0.0, up_m]))
 
     def _show(self, path: str, time: float) -> None:
@@ -302,7 +302,7 @@ def face_residuals(points_C: Array, status: CalibrationStatus) -> Array:
 
 
 def _circle_pose(fit: FlangeFit, status: CalibrationStatus) -> RigidTransform:
-    """The pose of a found circle in C, where the scanner's correction puts it."""
+    """Return the pose of a found circle in C, where the scanner's correction puts it."""
     return RigidTransform(
         RotationMatrix.MakeFromOneVector(np.asarray(fit.normal_C), 2), status.correction.points(fit.center_C)
     )

@@ -30,7 +30,7 @@ class WeldRow(NamedTuple):
     """One row of the weld's plots.
 
     Time s, torch and tip along the seam m, the felt seam to the left of the planned one m, deflection m, torch speed
-    m/s, whether the torch is on; NaN where there is no value.
+    m/s, whether the torch is on. NaN where there is no value.
     """
 
     time: float

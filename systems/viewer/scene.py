@@ -45,7 +45,7 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty_at(estimate: CalibrationEstimate, p_BQ: Array) -> Uncertainty:
-    """The uncertainty of a scanned point at p_BQ (3,) m, drawn with half axes of 0.1 m at most."""
+    """Return the uncertainty of a scanned point at p_BQ (3,) m, drawn with half axes of 0.1 m at most."""
     values, vectors = np.linalg.eigh(point_error_covariance(estimate, p_BQ))
     if np.linalg.det(vectors) < 0:
         vectors[:, 0] *= -1.0
@@ -63,7 +63,7 @@ class LegendKey(NamedTuple):
 
 
 def legend(phase: str, magnification: int | None = None) -> list[LegendKey]:
-    """The legend of a phase of the weld job.
+    """Return the legend of a phase of the weld job.
 
     `magnification` of the drawn uncertainty, 0 where it is written beside it, None where there is none yet.
     """
@@ -94,7 +94,7 @@ def _css(rgba: Rgba) -> str:
 def textured_board(
     name: str, width_m: float, height_m: float, picture: NDArray[np.uint8], *, glows: bool = False
 ) -> Mesh:
-    """A rectangle centred on the origin in the x-y plane, facing +z, x to the right of the picture and y up.
+    """Return a rectangle centred on the origin in the x-y plane, facing +z, x to the right of the picture and y up.
 
     `picture` is (h, w) grey or (h, w, 3) BGR uint8. Renderers interpolate between its pixels, so its edges are smooth,
     as in a camera's picture of a print. `glows`: a viewer shows it as bright from every side of the light. Edges of
@@ -184,7 +184,7 @@ def draw_sign(meshcat: Meshcat, path: str, text: str, height_m: float, colour: t
 
 
 def coloured(points: Array, colours: NDArray[np.uint8] | None = None) -> PointCloud:
-    """A cloud of points (n, 3) m, with RGB (n, 3) where they are given."""
+    """Return a cloud of points (n, 3) m, with RGB (n, 3) where they are given."""
     fields = BaseField.kXYZs if colours is None else BaseField.kXYZs | BaseField.kRGBs
     cloud = PointCloud(len(points), Fields(fields))
     cloud.mutable_xyzs()[:] = np.asarray(points).T

@@ -100,7 +100,7 @@ class WeldView:
         self._pieces = piece + 1
 
     def _draw_way_back(self, servo: ServoReport, time: float) -> None:
-        """While an operator holds the weld, and until it goes on: the torch's way back to where it goes on."""
+        """Draw the torch's path back to where the weld goes on, from an operator's hold until then."""
         way = servo.interruption.way_back
         if bool(way) == self._way_shown:
             return

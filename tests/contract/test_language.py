@@ -20,19 +20,20 @@ PAGES = [
     *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in WRITTEN_BY_COMMANDS),
 ]
 FOLDERS = ("models", "calibration", "welding", "systems", "tools")
-# Words of the house that an engineer of the field does not use, and in a few cases uses for something else.
+# Words of the house that an engineer of the field does not use, and in a few cases uses for something else. The name of
+# an option (--seen) is no word.
 FORBIDDEN = re.compile(
-    r"\b(rooms?|halls?|house|persons?|furnishings?|seen|said|tells?|told|stands|kept|ways?|knock(?:s|ed)?"
+    r"(?<!--)\b(rooms?|halls?|house|persons?|furnishings?|seen|said|tells?|told|stands|kept|ways?|knock(?:s|ed)?"
     r"|open directions?|doubts?|remed(?:y|ies))\b",
     re.IGNORECASE,
 )
 # What the source still has of each; a count may only fall. Lower the number when it did.
 CEILINGS = {
-    "first lines that are longer than one line": 1079,
-    "first lines with a forbidden word": 254,
-    "docstring sentences over 30 words": 397,
-    "messages with a sentence over 30 words": 32,
-    "messages with a forbidden word": 82,
+    "first lines that are longer than one line": 41,
+    "first lines with a forbidden word": 42,
+    "docstring sentences over 30 words": 197,
+    "messages with a sentence over 30 words": 10,
+    "messages with a forbidden word": 33,
 }
 
 FENCE = re.compile(r"^(`{3,}|~{3,})[^\n]*\n.*?^\1[ \t]*$", re.MULTILINE | re.DOTALL)

@@ -15,7 +15,7 @@ from tests.places import ROOT
 BOUNDS = {
     "modules": 534,  # files with code in the five folders
     "code lines": 96_080,  # without blank lines, comments and docstrings
-    "lines of studies": 10_583,  # in tools/studies, all lines
+    "lines of studies": 10_590,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

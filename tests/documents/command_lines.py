@@ -11,7 +11,18 @@ ROBOT, EMULATED = "192.168.56.101", "127.30.0.9"  # the robot of the pages, and 
 
 # Commands that take less than some seconds and start no simulation, by their first words.
 CHEAP = (
-    *("robots", "schema", "part", "tool check", "print-board", "verify", "export", "profiler edge", "profiler sphere"),
+    *(
+        "robots",
+        "schema",
+        "part",
+        "tool check",
+        "print-board",
+        "verify",
+        "apply",
+        "export",
+        "profiler edge",
+        "profiler sphere",
+    ),
     *(
         "tablet calibrate",
         "profiler seam",

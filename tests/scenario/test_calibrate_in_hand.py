@@ -124,7 +124,7 @@ def test_at_rest_the_other_command_is_named(recording: Truth, tmp_path: Path) ->
     folder.mkdir()
     text = (recording[0] / "dataset.yaml").read_text()
     (folder / "dataset.yaml").write_text(text.replace("mode: motion", "mode: static"))
-    with pytest.raises(DatasetError, match="only 'weldcal calibrate' reads it"):
+    with pytest.raises(DatasetError, match="Give the folder to 'weldcal calibrate'"):
         calibrate_dataset(folder, tmp_path / "out")
 
 

@@ -87,7 +87,7 @@ def test_poses_that_cannot_be_used_are_input_errors(robot: Array, words: str) ->
 
 
 def test_camera_positions_in_mm_are_named() -> None:
-    with pytest.raises(InputError, match="are in mm by the robot's motion, and in m as stated"):
+    with pytest.raises(InputError, match="fit the robot's motion in mm, but m is stated"):
         weldcal.hand_eye(F, scaled(G, 1000.0))
 
 

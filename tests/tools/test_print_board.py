@@ -142,7 +142,7 @@ def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
         (lambda: board_sheet(CharucoBoard(20, 20, 15.0, 10.0, "4X4_100"), "A4"), "has 100 markers"),
         (
             lambda: board_sheet(CharucoBoard(8, 6, 40.0, 30.0), "A4"),
-            "320 x 240 mm do not fit on A4, which has room for 186 x 239 mm",
+            "320 x 240 mm do not fit on A4, whose printable area is 186 x 239 mm",
         ),
         (lambda: CharucoBoard(8, 6, 4.0, 4.0), "smaller than its squares"),
         (lambda: board_sheet(CharucoBoard(), "B5"), "There is no paper 'B5'"),

@@ -59,7 +59,7 @@ class LazyCommands(MutableMapping[str, Any]):
         self._made: dict[str, Any] = dict.fromkeys(self.entries) | dict(groups)
 
     def is_made(self, name: str) -> bool:
-        """Whether the command needs no import, or does not exist."""
+        """Return whether the command needs no import, or does not exist."""
         return self._made.get(name) is not None or name not in self.entries
 
     def __getitem__(self, name: str) -> Any:
@@ -114,7 +114,7 @@ class CommandGroup(TyperGroup):
         return list(self.commands)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command; while a shell completes its name, only its line of help, without an import."""
+        """Return the command; while a shell completes its name, only its line of help, without an import."""
         commands: LazyCommands = self.commands  # type: ignore[assignment]
         if ctx.resilient_parsing and not commands.is_made(cmd_name):
             entry = commands.entries[cmd_name]
@@ -161,7 +161,7 @@ def weldcal(
 
 
 def build_app() -> typer.Typer:
-    """The Typer application with all groups and commands."""
+    """Return the Typer application with all groups and commands."""
     place = {title: number for number, title in enumerate(ORDER)}
     entries = sorted(find_commands().values(), key=lambda entry: (place.get(entry.title, len(ORDER)), entry.title))
     parts: dict[str, list[Entry]] = {"": [], **{name: [] for name in GROUPS}}

@@ -37,7 +37,7 @@ class Entry:
     module: str
 
     def load(self) -> CliCommand:
-        """The command; imports its module."""
+        """Return the command; imports its module."""
         for value in vars(importlib.import_module(self.module)).values():
             if isinstance(value, CliCommand) and value.title == self.title:
                 return value

@@ -32,7 +32,7 @@ def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
 
 
 def switch(names: str, help: str, **settings: Any) -> Any:
-    """An option without a value: "--name", or "--name/--no-name"; `settings` as in `option`."""
+    """Return an option without a value: "--name", or "--name/--no-name"; `settings` as in `option`."""
     return typer.Option(names, help=help, **settings)
 
 

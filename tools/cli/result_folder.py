@@ -61,7 +61,7 @@ def _require_no_result(folder: Path) -> None:
 
 
 def _has_journal(folder: Path) -> bool:
-    """Whether the folder holds the journal of a study, or of one of its steps."""
+    """Return whether the folder holds the journal of a study, or of one of its steps."""
     return any(True for pattern in (JOURNAL, f"*/{JOURNAL}") for _ in folder.glob(pattern))
 
 

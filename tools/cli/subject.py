@@ -95,7 +95,7 @@ def _merged(name: str, users: Mapping[str, _Parameter]) -> inspect.Parameter:
 
 
 def _default(users: Mapping[str, _Parameter]) -> str:
-    """The defaults as the help shows them: the one that all share, or that of each study."""
+    """Return the defaults as the help shows them: the one that all share, or that of each study."""
     texts = {word: _text(p) for word, p in users.items()}
     if len(set(texts.values())) == 1:
         return next(iter(texts.values()))

@@ -138,7 +138,7 @@ def compare_algorithm1(
 
 
 def _icp_record(held: Observation, X_BC: RigidTransform, verification: Verification) -> IcpRecord:
-    """The published figure for our own calibration, made without the verification pose."""
+    """Return the published figure for our own calibration, made without the verification pose."""
     error = icp_error(X_BC, verification)
     return IcpRecord(
         id=held.id,

@@ -20,7 +20,7 @@ FARTHEST_M = 20.0  # a choice: no 3D scanner of this size of flange measures far
 @command("apply", common=("overwrite", "json", "debug"), short_help="Correct the points of a scan by a calibration.")
 def apply(
     call: Call,
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a calibration, or calibration.yaml.")],
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a result, or its YAML file.")],
     cloud: Annotated[Path, typer.Argument(metavar="CLOUD", help="A scan: PLY, PCD, NPZ, NPY, text, depth image.")],
     to: Annotated[
         Path | None,

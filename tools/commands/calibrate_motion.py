@@ -138,7 +138,7 @@ def calibrate_motion(
 
 
 def _target(estimate: MotionEstimate) -> tuple[Array, Array]:
-    """Centre (3,) m and normal (3,) in the base of the fixed target that was seen."""
+    """Return centre (3,) m and normal (3,) in the base of the fixed target in the scans."""
     X_BT = estimate.fit.X_FR
     assert X_BT is not None
     return np.asarray(X_BT.translation()), X_BT.rotation().matrix()[:, 2].copy()

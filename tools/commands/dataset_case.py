@@ -41,7 +41,7 @@ def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard
 
 
 def write_case(folder: Path, case: DoctorCase) -> None:
-    """Write what was seen of the flange beside a result, for `weldcal doctor`."""
+    """Write the flange of each scan beside a result, for `weldcal doctor`."""
     write_apart(folder / NAME, case_text(case))
 
 

@@ -66,7 +66,7 @@ class RunResult(Protocol):
         """The result folder."""
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
 
 
 Runner = Callable[[Scenario, RunOptions, Progress], RunResult]
@@ -81,7 +81,7 @@ RUNNERS: dict[str, Runner] = {
 
 
 def kind_of(scenario: Scenario) -> str:
-    """The key of the scenario's job; empty for the weld job."""
+    """Return the key of the scenario's job; empty for the weld job."""
     return job_of(scenario).key
 
 
@@ -109,7 +109,7 @@ class AnyOutcome:
         return self.options.out
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `demo` for such a job."""
+        """Return the JSON object of `demo` for such a job."""
         run = self.finished.run
         return run_document(run, self.options, self.finished.robot) | run.timing()
 

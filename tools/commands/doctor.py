@@ -76,8 +76,8 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():
         raise InputError(
-            f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the"
-            " dataset's folder."
+            f"'{folder}' is a result of an older version, without the flange of each scan. Calibrate again, or give"
+            " the dataset's folder."
         )
     return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
 
@@ -102,7 +102,7 @@ def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Prog
 
 
 def _other_flange(data: Dataset, stated: FlangeStandard) -> FlangeStandard:
-    """The standard flange that a few scans show where they do not show the stated one; else the stated one."""
+    """Return the standard flange that a few scans show where they do not show the stated one; else the stated one."""
     ids = list(data.clouds)
     some = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(_LOOKED_AT, len(ids))).astype(int))]
     if len(_found_in(data, some, stated)) > len(some) // 2:

@@ -226,7 +226,7 @@ def read_pose(result: Path, robot: str | None, pose: str | None) -> ExportedPose
 
 
 def typed_pose(text: str) -> RigidTransform:
-    """The pose of seven numbers: x y z (m) and a quaternion x y z w, with or without commas and brackets.
+    """Return the pose of seven numbers: x y z (m) and a quaternion x y z w, with or without commas and brackets.
 
     Raises:
         InputError: other than seven numbers, or a quaternion that is no unit one.
@@ -304,7 +304,7 @@ def check_frames(parent: str, child: str, *, scoped: bool) -> None:
 
 
 def ros2_files(given: ExportedPose, folder: Path, X: RigidTransform, parent: str, child: str) -> dict[Path, str]:
-    """The files for ROS 2 by their paths, the launch file first."""
+    """Return the files for ROS 2 by their paths, the launch file first."""
     words = shlex.split(export_ros2(X, parent, child))
     arguments = words[words.index("static_transform_publisher") + 1 :]
     pairs = "".join(
@@ -332,7 +332,7 @@ def ros2_files(given: ExportedPose, folder: Path, X: RigidTransform, parent: str
 def drake_files(
     given: ExportedPose, path: Path, X: RigidTransform, parent: str, child: str, *, station: bool
 ) -> dict[Path, str]:
-    """The Drake directives of the child frame, or of arm, flange and scanner with their models, by their paths.
+    """Return the Drake directives of the child frame, or of arm, flange and scanner with their models, by their paths.
 
     Raises:
         InputError: no name of a YAML file; the robot is not known, or its arm is not drawn.

@@ -138,7 +138,7 @@ def verify_one(result: str, dataset: str, out: str, limit_mm: float | None, seed
 
 
 def _step(farm: Farm, what: str) -> Farm:
-    """The farm for one of the two steps: its tasks in a folder of their own, half of the progress each."""
+    """Return the farm for one of the two steps: its tasks in a folder of their own, half of the progress each."""
     before = 0.0 if what == "calibrations" else 0.5
 
     def tell(stage: str, share: float) -> None:
@@ -229,7 +229,7 @@ def _refuted_since(datasets: Sequence[Checked]) -> str | None:
 
 
 def _grows(errors_mm: Sequence[float | None]) -> bool:
-    """Whether errors grow with time: Kendall's rank correlation at FALSE_ALARM. Seven datasets are the least."""
+    """Return whether errors grow with time: Kendall's rank correlation at FALSE_ALARM. Seven datasets are the least."""
     seen = [mm for mm in errors_mm if mm is not None]
     if len(seen) < 7:
         return False

@@ -225,8 +225,8 @@ def run_hand_eye(
     Writes report.html besides the exports.
 
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the
-    scanner, for the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and
-    robot errors is applied: the robot's errors are sought in the poses that the corners left); ``kinematics``: file of
+    scanner, for the next pose. ``refine``: "joints" or "links", errors of that robot to look for (one of corners and
+    robot errors is applied: the robot's errors are sought in the poses that the corners left). ``kinematics``: file of
     that robot's own kinematics, whose poses at the joint angles replace the stated ones. ``limit_mm`` is the held-out
     error at the target, 95 %, that the job allows. ``board``: the board in the pictures of the folder ``file``, see
     ``parse_board``; ``intrinsics``: the file that states their camera.
@@ -346,7 +346,7 @@ def run_hand_eye(
 
 
 def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
-    """The pairs of two recordings in motion of a folder; None where it holds none."""
+    """Return the pairs of two recordings in motion of a folder; None where it holds none."""
     if not path.is_dir() or (path / "pairs.npz").exists():
         return None
     try:
@@ -363,7 +363,7 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Cloc
 
 
 def _solved_pictures(shots: PictureSet, config: HandEyeConfig) -> tuple[HandEyeResult, PosePairs, PictureResult]:
-    """The result of pictures; which of them are not used is said by their names."""
+    """Return the result of pictures, with the names of those that are not used."""
     result, pairs, pictures = solve_pictures(shots, lambda pairs: solve_pairs(pairs, config))
     left = [f"{p.name} ({p.why[0].lower()}{p.why[1:].rstrip('.')})" for p in pictures.pictures if p.why]
     warnings = [w for w in result.warnings if "were excluded:" not in w]
@@ -427,7 +427,7 @@ def _only_camera(result: HandEyeResult) -> HandEyeResult:
 
 
 def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEyeResult:
-    """The poses of a file's mounting, with a test for the usual mistakes in files.
+    """Return the poses of a file's mounting, with a test for the usual mistakes in files.
 
     Raises:
         InconsistentPoses: the correction of one mistake makes the poses agree far better; others as solve_problem.
@@ -475,7 +475,7 @@ def solve_arrays(
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:
-    """The equation of a file's mounting."""
+    """Return the equation of a file's mounting."""
     return full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, pairs.mode == "co_manipulation"))
 
 

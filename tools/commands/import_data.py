@@ -54,7 +54,7 @@ class Imported:
     notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of the command."""
+        """Return the JSON object of the command."""
         return {
             "state": "done",
             "kind": self.kind,
@@ -209,7 +209,7 @@ def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting
     if len(data.readings) > 1:
         if not name:
             raise InputError(
-                "The poses can be read in several ways, and the scans choose. Name the flange: --flange"
+                "The poses fit several conventions, and only the scans can decide. Name the flange, for example --flange"
                 " iso9409-1-50-4-m6."
             )
         data = fit_flanges(data, get_flange(name), holes=False).data or data

@@ -77,8 +77,7 @@ def monitor(
     ] = None,
     record: Annotated[bool, switch("--record", "Live: also write what streams as a recording.")] = False,
 ) -> Outcome:
-    """Track the flange through a recording, or live, and test the calibration: has the scanner moved, when, by how
-    much, which way.
+    """Track the flange in a recording, or live, and test whether, when and how far the scanner has moved.
 
     Times are on the robot's clock. Translation and rotation are those of the scanner about its own origin, in the
     robot's base.
@@ -116,7 +115,7 @@ def monitor(
 
 
 def _is_scenario(name: str) -> bool:
-    """Whether a name is that of a scenario and not of a recording's folder."""
+    """Return whether a name is that of a scenario and not of a recording's folder."""
     return not Path(name).is_dir() and (name.endswith((".yaml", ".yml")) or name in scenario_names())
 
 
@@ -164,7 +163,7 @@ def monitor_recording(
     result = load_result(Path(calibration))
     data = load_motion_dataset(Path(folder), robot=read_header(Path(folder) / "dataset.yaml").robot or result.robot)
     if data.in_hand:
-        raise InputError(f"'{folder}' is of a scanner on the flange; monitor watches one that stands beside the robot.")
+        raise InputError(f"'{folder}' has scans of a scanner on the flange. Give scans of a scanner beside the robot.")
     standard = get_flange(flange or data.header.flange or result.flange)
     motion = ContinuousMotion(data.stream)
     X_FR = data.X_FR
@@ -248,7 +247,7 @@ def recalibrated_result(
 
 
 def classified(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
-    """The event with its cause, where what stands still in the scans before and after it tells."""
+    """Return the event with its cause, where the static surroundings in the scans before and after show it."""
     if e.kind != MOVED or e.since_start:
         return e
     t = watched.rows.times
@@ -269,7 +268,7 @@ def classified(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result
 
 
 def causes(watched: DriftHistory) -> str:
-    """What the data tell of the cause, over all events."""
+    """Return what the data show of the cause, over all events."""
     return "; ".join(dict.fromkeys(e.cause for e in watched.events))
 
 
@@ -332,7 +331,7 @@ class LiveMonitor:
         return replace(first, found=replace(first.found, against=[*held, *first.found.against]))
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object: the run, then what `monitor` says of a recording, which it ends with."""
+        """Return the JSON object: the run, then what `monitor` says of a recording, which it ends with."""
         run = self.finished.run
         job: AddedMotion = run.cell.job
         live = job.drift(run.root)
@@ -362,7 +361,7 @@ class LiveMonitor:
 
 
 def monitored_scenario(name: str, calibration: Path, frames: int | None, false_alarms_per_hour: float) -> Scenario:
-    """The scenario as it is watched: its motion, or that of the default cube where it has another job.
+    """Return the scenario as it is watched: its motion, or that of the default cube where it has another job.
 
     Raises:
         InputError: its scanner does not stream, or it cannot be run so.

@@ -68,7 +68,7 @@ def _fused(
     motion: ContinuousMotion,
     seed: int,
 ) -> tuple[BodyModel, float]:
-    """The link's model from the first frames, and the delay of those."""
+    """Return the link's model from the first frames, and the delay of those."""
     first = replace(data, frames=data.frames[:_FUSED])
     flange = ContinuousMotion(data.stream)
     seen = see_frames(first, standard, flange, X_BC=result.X_BC, seed=seed).observed
@@ -88,7 +88,7 @@ def _fused(
 
 
 def _extent(arm: ArmModel, index: int) -> tuple[Array, float]:
-    """A sphere about a link's drawn body: middle (3,) m in its frame, radius m."""
+    """Return a sphere about a link's drawn body: middle (3,) m in its frame, radius m."""
     capsules = [c for c in link_capsules(arm) if c.link_index == index]
     ends = np.array([p for c in capsules for p in (c.p_start, c.p_end)])
     middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))

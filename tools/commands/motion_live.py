@@ -106,7 +106,7 @@ class MotionOutcome:
         return found
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         run, e = self.run, self.estimate
         taken, dropped = run.cell.job.counts(run.root)
         found: dict[str, object] = {
@@ -190,7 +190,7 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
 
 
 def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> CalibrationResult:
-    """The estimate as a result folder holds it."""
+    """Return the estimate as a result folder holds it."""
     scenario = outcome.run.cell.scenario
     scanner = scenario.scanner_config()
     return motion_result(

@@ -227,7 +227,7 @@ def _too_few(
     seen: int,
     refused: Mapping[str, str],
 ) -> str:
-    """The sentence where too few scans show the circle; a wider search says how far off the guess is."""
+    """Return the sentence where too few scans show the circle; a wider search says how far off the guess is."""
     begin = f"{seen} scan{'' if seen == 1 else 's'} show the circle, and {fewest(scene)} are needed."
     for id in list(refused)[:_TRIED_AGAIN]:
         with contextlib.suppress(FlangeNotFound, CloudError):
@@ -254,7 +254,7 @@ def recorded_report(
     started: float | None = None,
     **more: Any,
 ) -> RecordedMounting:
-    """The report of the circles that were seen at known joint angles, with held-out errors of five folds."""
+    """Write the report of the circles at known joint angles, with held-out errors of five folds."""
     result = solve_mounting(scene, seen, folds=5)
     sigma, within = expected_error(scene, result)
     status = MountingStatus(
@@ -279,7 +279,7 @@ def recorded_report(
 
 
 def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScene, Circle]:
-    """The scene and the circle that a dataset describes. Raises InputError for what dataset.yaml lacks."""
+    """Return the scene and the circle that a dataset describes. Raises InputError for what dataset.yaml lacks."""
     header, guess = data.header, data.X_BC_guess
     if robot not in known_arms():
         raise InputError(

@@ -51,7 +51,7 @@ class Mutation:
     why: str = ""
 
     def applied(self, source: str) -> str:
-        """The file with this mutation.
+        """Return the file with this mutation.
 
         Raises:
             InputError: the text does not occur exactly once.
@@ -93,7 +93,7 @@ class _Copy:
     root: Path
 
     def passes(self, tests: Sequence[str], limit_s: float) -> tuple[bool | None, str]:
-        """Whether tests pass, None where they could not run, and pytest's last line."""
+        """Return whether tests pass, None where they could not run, and pytest's last line."""
         run = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
         # pytest's own variables are of the run that calls this one. No byte code is written: two mutations of one
         # length within a second have the same stamp, and the second would run the byte code of the first.

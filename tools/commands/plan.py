@@ -52,7 +52,7 @@ def plan_motion(
         bool, switch("--device-clock/--no-device-clock", "Frames with the device's times, or arrivals only.")
     ] = True,
 ) -> Outcome:
-    """Predict what motions tell of the scanner's pose and clock, and write the best one as URScript. Nothing moves.
+    """Predict how well motions calibrate the scanner's pose and clock, and write the best as URScript. Nothing moves.
 
     The error is that of a point among the flange's places, one sigma, of noise alone.
     """
@@ -87,7 +87,7 @@ def _line(p: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A motion and what it is expected to tell, one sigma; infinite where it shows nothing.
+    """Hold a motion and its expected accuracy, one sigma; infinite where it shows nothing.
 
     ``cost_mm`` is the error of a point on a part in motion. ``corners_deg`` are the joint angles of a cube's
     corners, empty for a stream.

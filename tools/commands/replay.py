@@ -78,7 +78,7 @@ class Replay:
     cut_off: bool
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         found: dict[str, object] = {
             "state": IDENTICAL if self.first is None else DIFFERS,
             "seconds": self.seconds,
@@ -182,7 +182,7 @@ def view(
 
 
 def find_pages(result: Path) -> list[Path]:
-    """The absolute paths of the pages in a result folder (report first), or the one page that was given.
+    """Return the absolute paths of the pages in a result folder (report first), or the one page that was given.
 
     Raises:
         InputError: if there is no such folder or file, or it holds no page.

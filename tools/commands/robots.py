@@ -41,7 +41,7 @@ def robots(
 
 
 def _row(robot: Robot) -> Mapping[str, object]:
-    """A robot for JSON: metres, kilograms, radians, and degrees where the key says so."""
+    """Return a robot for JSON: metres, kilograms, radians, and degrees where the key says so."""
     chain = robot.chain
     return {
         "name": robot.name,
@@ -152,7 +152,7 @@ def configured(host: str, name: str | None) -> UrRtde:
 
 
 def with_transport(report: Preflight, config: UrRtde) -> Preflight:
-    """The report of a controller that is ready, with a further row: how the driver will reach it, and why so."""
+    """Return the report of a controller that is ready, with a further row: how the driver will reach it, and why so."""
     if not report.ok:
         return report
     transport, why = chosen_transport(config, report.version or (), report.upper_registers)
@@ -163,7 +163,7 @@ def with_transport(report: Preflight, config: UrRtde) -> Preflight:
 
 
 def with_host(report: Preflight) -> Preflight:
-    """The report of a controller that answered, with a further check: this computer's timing."""
+    """Return the report of a controller that answered, with a further check: this computer's timing."""
     if report.version is None:
         return report
     timing = measure_host()
@@ -179,7 +179,7 @@ def state_of(check: Check) -> str:
 
 
 def as_json(report: Preflight) -> Mapping[str, object]:
-    """The JSON object of the command; what was not read is null."""
+    """Return the JSON object of the command; what was not read is null."""
     problem = report.first_problem
     return {
         "state": "ready" if report.ok else "refused",

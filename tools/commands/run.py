@@ -63,7 +63,7 @@ RECORDED = (*LIVE, "record")
 
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
-    """The options of a run; its folder is named after the command and the scenario."""
+    """Return the options of a run; its folder is named after the command and the scenario."""
     return RunOptions(
         scenario=scenario,
         out=call.folder(command, scenario),
@@ -74,7 +74,7 @@ def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOpti
 
 
 def named_once(name: str | None, scenario: str, preset: str) -> str:
-    """The scenario, given as an argument or with --scenario.
+    """Return the scenario, given as an argument or with --scenario.
 
     Raises:
         typer.BadParameter: both are given, and differ.
@@ -322,7 +322,7 @@ def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float,
 
 
 def robot_at(host: str, scenario: Scenario) -> UrRtde:
-    """The robot at an address, with the scenario's tool as its payload."""
+    """Return the robot at an address, with the scenario's tool as its payload."""
     if scenario.tool == "none":
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
     if scenario.tool == "pen":

@@ -74,7 +74,7 @@ class LiveTouches:
         return self.options.out
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `verify --scenario`."""
+        """Return the JSON object of `verify --scenario`."""
         found: dict[str, object] = {} if self.report is None else self.report.summary()
         found |= {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
         if self.state == "held":
@@ -83,7 +83,7 @@ class LiveTouches:
 
 
 def touching(name: str, result: Path, points: int | None = None) -> Scenario:
-    """A scenario of a weld as one whose robot touches the part, to judge ``result``.
+    """Return a scenario of a weld as one whose robot touches the part, to judge ``result``.
 
     Raises:
         InputError: the scenario has no part to touch, or the result cannot be used.

@@ -376,7 +376,7 @@ def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observa
 
 
 def _verdict(new: list[PoseError], limit_mm: float | None, source: str, diagnostics: list[str]) -> Verdict:
-    """The verdict on the new scans alone; ``diagnostics`` are sentences that leave it at "use with care"."""
+    """Return the verdict on the new scans alone; ``diagnostics`` are sentences that leave it at "use with care"."""
     if not new:
         return Verdict(NONE, None, "The calibration used all of these scans. Take new scans to verify it.")
     median = float(np.median([p.error_mm for p in new]))
@@ -400,7 +400,7 @@ def _verdict(new: list[PoseError], limit_mm: float | None, source: str, diagnost
 
 
 def _alike(data: Dataset, observations: tuple[Observation, ...]) -> list[str]:
-    """A sentence where these scans cannot show an error that is constant in the flange's frame."""
+    """Return a sentence where these scans cannot show an error that is constant in the flange's frame."""
     if data.pairs and not all(p.has_orientation for p in data.pairs):
         return ["The pairs have no orientations of the flange. Whether the orientation varies is not known."]
     turned = [o.X_BR for o in observations]
@@ -413,7 +413,7 @@ def _alike(data: Dataset, observations: tuple[Observation, ...]) -> list[str]:
 
 
 def _gross(result: CalibrationResult, poses: tuple[PoseError, ...]) -> list[str]:
-    """A sentence on scans far off all others."""
+    """Return a sentence on scans far off all others."""
     n, median = len(poses), float(np.median([p.error_mm for p in poses]))
     gross = [p for p in poses if p.error_mm > _GROSS * max(median, result.held_out_mm.get("p95") or 0.0)]
     if not gross:
@@ -476,7 +476,7 @@ def _diagnostics(
 
 
 def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...]) -> str:
-    """The warning about an absent scanner correction, with the scale error where these scans show one."""
+    """Return the warning about an absent scanner correction, with the scale error where these scans show one."""
     text = "The result holds no scanner correction, so these errors include the scale error of the scanner"
     scale, sigma = _scale_error(result, observations)
     if np.isfinite(sigma) and abs(scale) > _EVIDENT * sigma:

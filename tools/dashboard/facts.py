@@ -72,7 +72,7 @@ class Facts:
 
 
 def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
-    """The facts of a cell that was built and has not run yet."""
+    """Return the facts of a cell that was built and has not run yet."""
     settable = cell.station.robot.clock is None
     job, scenario = cell.job, cell.scenario
     if not isinstance(job, WeldJob):

@@ -97,7 +97,7 @@ class _Page:
             return self._pipe.recv()
 
     def _fresh(self) -> dict[str, Any]:
-        """The values, no older than half a period, however many watch; the rows are fetched with them."""
+        """Return the values, no older than half a period, however many watch; the rows are fetched with them."""
         with self._lock:
             if time.monotonic() - self._looked_at > 0.5 * PERIOD_S:
                 self._pipe.send(("look", *map(len, self._rows.values())))
@@ -110,7 +110,7 @@ class _Page:
             return self._values
 
     def _application(self) -> Flask:
-        """The pages: with a key they have buttons, with a token they are under it."""
+        """Return the pages: with a key they have buttons, with a token they are under it."""
         view_url, key, token = self._setup.view_url, self._setup.key, self._setup.token
         root = "" if token is None else f"/{token}"
         app = Flask("weldcal.dashboard", template_folder=str(_PAGE), static_folder=None)

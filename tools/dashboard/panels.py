@@ -253,7 +253,7 @@ def _profiler(state: ProfilerState) -> dict[str, Any]:
 def _time_plot(
     title: str, unit: str, curves: Sequence[tuple[str, str, Array, Array]], x_unit: str, *, middle: bool = True
 ) -> dict[str, Any]:
-    """A plot over time or frames; `middle`: about zero, else from the least value to the largest."""
+    """Return a plot over time or frames; `middle`: about zero, else from the least value to the largest."""
     values = np.concatenate([y[np.isfinite(y)] for *_, y in curves]) if curves else np.empty(0)
     x = curves[0][2] if curves else np.empty(0)
     if middle:
@@ -283,7 +283,7 @@ def _plot(
     *,
     dots: bool = False,
 ) -> dict[str, Any]:
-    """A plot for the page: curves of (name, colour, points), ranges, and a dashed line with its name."""
+    """Return a plot for the page: curves of (name, colour, points), ranges, and a dashed line with its name."""
     last = [[p for p in points if math.isfinite(p[1])][-1:] for *_, points in curves]
     places = 0 if y[1] - y[0] > 20.0 else 1 if y[1] - y[0] > 2.0 else 2
     now = ", ".join(f"{p[0][1]:z.{max(places, 1)}f}" for p in last if p)
@@ -314,7 +314,7 @@ def _thinned(rows: Array) -> Array:
 
 
 def _high(values: Sequence[float]) -> float:
-    """The next of 1, 2, 5, 10 ... at or above the largest value."""
+    """Return the next of 1, 2, 5, 10 ... at or above the largest value."""
     largest = max([1e-3, *(v for v in values if math.isfinite(v))])
     power = 10.0 ** math.floor(math.log10(largest))
     return float(next(k * power for k in (1.0, 2.0, 5.0, 10.0) if k * power >= largest * (1.0 - 1e-9)))

@@ -29,7 +29,7 @@ def picture_number(moment: Moment) -> int:
 
 
 def picture_png(moment: Moment) -> bytes | None:
-    """The newest picture as a PNG of WIDTH_PX; None where there is none."""
+    """Return the newest picture as a PNG of WIDTH_PX; None where there is none."""
     scan, picture = moment.shown.get("scan"), moment.shown.get("picture")
     if isinstance(scan, Scan) and scan.points_C.size:
         estimate = moment.shown.get("flange_estimate")
@@ -42,7 +42,7 @@ def picture_png(moment: Moment) -> bytes | None:
 
 
 def depth_picture(scan: Scan, estimate: FlangeEstimate | None) -> NDArray[np.uint8]:
-    """A depth picture (h, WIDTH_PX, 3) BGR, near bright; around a flange that was found in this scan a ring."""
+    """Return a depth picture (h, WIDTH_PX, 3) BGR, near bright; around a flange that was found in this scan a ring."""
     step = max(1, scan.points_C.shape[1] // WIDTH_PX)
     points = scan.points_C[::step, ::step]
     z = points[:, :, 2]

@@ -20,7 +20,7 @@ _ROWS = 1500  # of the weld, in the page
 
 
 def with_overlay(html: str, run: Run[Any], live: LiveView, title: str) -> str:
-    """The page of Meshcat.StaticHtml() with the overlay of this run; unchanged where it has no end of a body."""
+    """Return the page of Meshcat.StaticHtml() with the overlay of this run; unchanged where it has no end of a body."""
     head, end, tail = html.rpartition("</body>")
     if not end:
         return html
@@ -31,7 +31,7 @@ def with_overlay(html: str, run: Run[Any], live: LiveView, title: str) -> str:
 
 
 def _told(cell: Cell[Any], run: Run[Any], live: LiveView, title: str) -> dict[str, Any]:
-    """What the overlay tells at each time of the recording."""
+    """Return the overlay's text at each time of the recording."""
     facts = facts_of(cell, title, "")
     weld = weld_rows(live.weld[:: max(1, len(live.weld) // _ROWS)])
     words = facts.required_mm == facts.required_mm and bool(facts.seconds)

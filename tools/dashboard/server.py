@@ -89,7 +89,7 @@ class Dashboard:
 
 
 def _bound(host: str) -> socket.socket:
-    """A listening socket on the first free port of PORTS, or on any."""
+    """Return a listening socket on the first free port of PORTS, or on any."""
     for port in (*PORTS, 0):
         found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:

@@ -103,11 +103,11 @@ class DashboardSource:
         return True
 
     def rows(self, weld: int, scans: int) -> dict[str, Any]:
-        """The rows of the plots from these numbers on."""
+        """Return the rows of the plots from these numbers on."""
         return {"weld": weld_rows(self.live.weld[weld:]), "scans": scan_rows(self.live.scans[scans:])}
 
     def values(self) -> dict[str, Any]:
-        """All present values of the page."""
+        """Return all present values of the page."""
         moment, facts, operator = self.live.moment, self.facts, self.operator
         state, line = self._state()
         weld = weld_values(facts, moment, self.live.weld)
@@ -148,7 +148,7 @@ class DashboardSource:
         return left if left is None or not self.operator.pace else round(left / self.operator.pace)
 
     def _state(self) -> tuple[str, str]:
-        """The state in large letters, and the line under it: by whom and why, or what the arm does."""
+        """Return the state in large letters, and the line under it: by whom and why, or what the arm does."""
         moment, operator = self.live.moment, self.operator
         doing = self._doing()
         if self._ended is not None:
@@ -173,7 +173,7 @@ class DashboardSource:
         return phase_words(moment.command.phase) if "calibration_status" in moment.shown else self._stage
 
     def picture(self) -> bytes | None:
-        """The newest scan or picture as a PNG, or None."""
+        """Return the newest scan or picture as a PNG, or None."""
         return picture_png(self.live.moment)
 
     def _go_on_line(self) -> str:

@@ -28,12 +28,12 @@ def mm(metres: float, digits: int = 3) -> float | None:
 
 
 def number(value: float, digits: int = 3) -> float | None:
-    """A number for JSON, rounded; None for one that is not finite."""
+    """Return a number for JSON, rounded; None for one that is not finite."""
     return round(value, digits) if math.isfinite(value) else None
 
 
 def steps(facts: Facts, phase: str) -> list[dict[str, str]]:
-    """The job's steps, each "done", "now" or "next"; none for a job that states no steps."""
+    """Return the job's steps, each "done", "now" or "next"; none for a job that states no steps."""
     at = next((k for k, (_, phases) in enumerate(facts.steps) if phase in phases), None)
     if phase == "done":
         at = len(facts.steps)
@@ -46,7 +46,7 @@ def steps(facts: Facts, phase: str) -> list[dict[str, str]]:
 
 
 def weld_values(facts: Facts, moment: Moment, newest: Sequence[WeldRow]) -> dict[str, Any] | None:
-    """The weld's present values; None while the tip does not follow a seam."""
+    """Return the weld's present values; None while the tip does not follow a seam."""
     report, planned = moment.shown.get("servo_report"), moment.shown.get("planned_seam")
     if not isinstance(report, ServoReport) or not isinstance(planned, PlannedSeam) or planned.seam is None:
         return None
@@ -92,7 +92,7 @@ def left_s(facts: Facts, moment: Moment, share: float = 0.0) -> float | None:
 
 
 def scan_values(facts: Facts, moment: Moment) -> dict[str, Any] | None:
-    """The calibration's present values; None where the job does not calibrate."""
+    """Return the calibration's present values; None where the job does not calibrate."""
     status, pose = moment.shown.get("calibration_status"), moment.shown.get("next_pose")
     if not isinstance(status, CalibrationStatus) or not math.isfinite(facts.required_mm):
         return None
@@ -111,7 +111,7 @@ def scan_values(facts: Facts, moment: Moment) -> dict[str, Any] | None:
 
 
 def _last_scan(status: CalibrationStatus) -> str | None:
-    """The newest scan: used with its residual, or why it was refused."""
+    """Return the newest scan: used with its residual, or why it was refused."""
     if status.verifications:
         last = status.verifications[-1]
         return f"{last.label}, held out: the calibration is {1e3 * last.error_m:.2f} mm off there"

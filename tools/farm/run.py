@@ -47,7 +47,7 @@ class Journal:
             self._write(head)
 
     def result(self, task: str, arguments: Mapping[str, Any]) -> Result | None:
-        """The result of a task with these arguments; None where it has not been finished."""
+        """Return the result of a task with these arguments; None where it has not been finished."""
         return self._found.get(_key(task, arguments))
 
     def add(self, task: str, arguments: Mapping[str, Any], result: Result) -> None:
@@ -72,7 +72,7 @@ def _key(task: str, arguments: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Farm:
-    """Where a study's tasks run and where their results are kept.
+    """Hold where a study's tasks run and where their results are stored.
 
     Attributes:
         folder: of the study's results; a second run with the same folder does only what is missing.
@@ -88,7 +88,7 @@ class Farm:
 
     @classmethod
     def of(cls, folder: Path, given: Mapping[str, Any], progress: Progress) -> Self:
-        """The farm of a command's options --workers and --scheduler."""
+        """Return the farm of a command's options --workers and --scheduler."""
         return cls(folder, given.get("workers"), given.get("scheduler"), progress)
 
     def run(

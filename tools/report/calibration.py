@@ -110,8 +110,8 @@ class Algorithm1Outcome:
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder.
 
-    ``observations`` include the scanner correction where one was accepted; ``notes`` say in which form the dataset was
-    read; ``clouds`` are each scan's points (N, 3) m of C about its flange; ``limit_mm`` is the error that the job
+    ``observations`` include the scanner correction where one was accepted. ``notes`` say in which form the dataset was
+    read. ``clouds`` are each scan's points (N, 3) m of C about its flange. ``limit_mm`` is the error that the job
     allows (None: not stated).
     """
 
@@ -153,7 +153,7 @@ class CalibrationReport:
 
     @property
     def _remarks(self) -> list[str]:
-        """Those of the warnings that tell what was done, not what could be wrong."""
+        """Return those of the warnings that report what was done, not what could be wrong."""
         applied = self.scanner is not None and self.scanner.accepted is not None
         return [*([self.scanner.sentence] if applied and self.scanner is not None else []), *self._refined]
 
@@ -209,7 +209,7 @@ class CalibrationReport:
         return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object of `calibrate`."""
+        """Return the JSON object of `calibrate`."""
         interval = self.held_out_interval_mm
         r = self.result
         a = self.algorithm1
@@ -251,7 +251,7 @@ class CalibrationReport:
 
 
 def scanner_pose(result: CalibrationResult) -> ShownPose:
-    """The result's pose with its frames in words."""
+    """Return the result's pose with its frames in words."""
     return ShownPose(result.symbol, SCANNER[result.symbol], result.X_BC)
 
 
@@ -294,7 +294,7 @@ HEADER = ("pose", "plane, mm", "outer edge, mm", "bore, mm", "holes", "holes, mm
 
 
 def feature_table(fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]) -> list[tuple[str, ...]]:
-    """The rows of ``feature_residuals`` as a report shows them, under ``HEADER``."""
+    """Return the rows of ``feature_residuals`` as a report shows them, under ``HEADER``."""
     places = {"plane_mm": 3, "outer_mm": 3, "bore_mm": 3, "holes_mm": 3, "turn_sigma_deg": 2}
     return [
         tuple(str(v) if k not in places else fixed(None if v is None else float(v), places[k]) for k, v in row.items())
@@ -303,14 +303,14 @@ def feature_table(fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePatt
 
 
 def fit_cells(fit: FlangeFit | None) -> tuple[str, str]:
-    """One sigma of the centre (3-D, mm) and the share of the edge seen (%); dashes without a fit."""
+    """Return one sigma of the centre (3-D, mm) and the visible share of the edge (%); dashes without a fit."""
     if fit is None:
         return "–", "–"
     return fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3), fixed(100 * fit.coverage, 0)
 
 
 def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     r = report.result
     used = report.estimate.inliers
     kept = [o for o, keep in zip(report.observations, used, strict=True) if keep]
@@ -385,7 +385,7 @@ def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
 
 
 def _scanner_rows(report: CalibrationReport) -> list[tuple[str, ...]]:
-    """The scanner's scale error and gradient by each source, per cent, with one sigma."""
+    """Return the scanner's scale error and gradient by each source, per cent, with one sigma."""
     if report.scanner is None:
         return []
     rows: list[tuple[str, ...]] = []

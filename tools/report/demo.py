@@ -390,7 +390,7 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
 
 
 def _process(result: DemoResult) -> list[tuple[str, str]]:
-    """The arc as it was set, and the heat it brought in where that can be said."""
+    """Return the arc as it was set, and its heat input where that is known."""
     weld, process = result.weld, result.run.cell.scenario.welding.process.process()
     if weld is None:
         return []
@@ -443,7 +443,7 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
 
 
 def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
-    """The weld for the pictures, over the planned seam; y of the base is drawn to the right, as the cell stands."""
+    """Return the weld for the pictures, over the planned seam; y of the base is drawn to the right, as in the cell."""
     log, named = weld.log, weld.log.telemetry
     keep = named["phase"] != list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
     speed = speed_along(log.time, log.p_BTorch)

@@ -43,7 +43,7 @@ class DoctorReport:
     spread_mm: float | None
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `doctor`."""
+        """Return the JSON object of `doctor`."""
         return {
             "state": "done",
             "source": self.source,
@@ -54,7 +54,7 @@ class DoctorReport:
         }
 
     def text(self) -> str:
-        """The printed answer."""
+        """Return the printed answer."""
         if not self.causes:
             return (
                 f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(CHECKED)}\n  Where"
@@ -73,7 +73,7 @@ class DoctorReport:
 
 
 def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
-    """The report of a diagnosis: at most three causes."""
+    """Return the report of a diagnosis: at most three causes."""
     spread = 1e3 * diagnosis.spread_m
     return DoctorReport(
         source,
@@ -88,7 +88,7 @@ _NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "
 
 
 def name_cause(problem: WeldcalError, case: DoctorCase) -> None:
-    """Add the likely cause, its evidence and its remedy to the sentence of a refusal, unless the sentence names it."""
+    """Add the likely cause, its evidence and its correction to a refusal, unless the refusal names it."""
     causes = worded("", diagnose(case), most=1).causes
     if not causes or causes[0].name in _NAMED_ALREADY:
         return

@@ -16,7 +16,7 @@ def write_json(path: Path, content: object) -> None:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
-    """A header line and one line per row."""
+    """Return a header line and one line per row."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

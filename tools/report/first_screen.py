@@ -58,7 +58,7 @@ class WorkPoint:
     held_out_95_mm: float | None
 
     def document(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         return {
             "p_B_mm": list(self.p_B_mm),
             "error_95_mm": self.error_95_mm,
@@ -68,7 +68,7 @@ class WorkPoint:
 
 
 def work_point_error(estimate: CalibrationEstimate, p_BQ: Array) -> WorkPoint:
-    """The error at the point (3,) m in the base, from the estimate's covariance and its held-out errors."""
+    """Return the error at the point (3,) m in the base, from the estimate's covariance and its held-out errors."""
     radius = radius_95(point_error_covariance(estimate, p_BQ))
     held = estimate.held_out.position_m[estimate.inliers]
     held = 1e3 * held[np.isfinite(held)]
@@ -81,7 +81,7 @@ ENOUGH_UNSEEN = 4
 """Unseen poses (scans, frames, landmarks) from which on they back a verdict; `verify` asks for as many new scans."""
 MOST_CONCERNS = 3
 NO_TOLERANCE = (
-    "No tolerance is stated, so nothing says whether this is good enough for your job: state it with --limit-mm."
+    "No tolerance is stated, so this result cannot be judged for your job. State the allowed error with --limit-mm."
 )
 
 
@@ -119,7 +119,7 @@ class Tolerance:
 
 
 def limit_tolerance(what: str, figure: float, limit_mm: float | None) -> Tolerance | None:
-    """The figure named ``what`` (mm) against the limit that --limit-mm states; None where it states none."""
+    """Return the figure named ``what`` (mm) against the limit that --limit-mm states; None where it states none."""
     return None if limit_mm is None else Tolerance(f"the {what},", figure, limit_mm, "--limit-mm")
 
 
@@ -176,7 +176,7 @@ class ShownPose:
         return f"{p[0]:.3f}, {p[1]:.3f}, {p[2]:.3f} mm; rotation vector {r[0]:.6f}, {r[1]:.6f}, {r[2]:.6f} rad"
 
     def rows(self) -> dict[str, str]:
-        """The rows for the terminal."""
+        """Return the rows for the terminal."""
         return pose_rows(self.X, self.symbol, self.words)
 
 
@@ -206,7 +206,7 @@ class Findings:
 
 
 def decide(found: Findings) -> tuple[str, str]:
-    """The verdict, one of three, and the reason; the first rule that applies decides.
+    """Return the verdict, one of three, and the reason; the first rule that applies decides.
 
     1. A verdict that the command settled by a rule of its own stays as it is.
     2. "do not use": the command decided against the result (the job was held, no pose, the scanner has moved).
@@ -235,7 +235,7 @@ def decide(found: Findings) -> tuple[str, str]:
 class FirstScreen:
     """The first screen.
 
-    `lead` is said before the verdict's reason; `more` are rows by name: other results, and what takes the place of a
+    `lead` is said before the verdict's reason. `more` are rows by name: other results, and what takes the place of a
     pose or a figure that the command does not have.
     """
 
@@ -273,11 +273,11 @@ class FirstScreen:
 
     @property
     def nothing(self) -> str:
-        """What is said where there is no concern besides the verdict's reason."""
+        """Return the text for no concern besides the verdict's reason."""
         return "Nothing was found." if self.verdict == USE or not self.found.against else "Nothing else was found."
 
     def rows(self) -> dict[str, str]:
-        """The rows for the terminal, by name; several things stand on lines of their own."""
+        """Return the rows for the terminal, by name; several things stand on lines of their own."""
         rows = {
             "verdict": f"{self.verdict}. {self.reason}",
             self.expected.what: f"{self.expected.figure} ({self.expected.backing})",
@@ -306,7 +306,7 @@ class FirstScreen:
         return rows | {"next": self.next.command or first_sentence(self.next.text)}
 
     def document(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         tolerance = self.found.tolerance
         return {
             "verdict": self.verdict,
@@ -376,7 +376,7 @@ def expected_error(
 
 
 def work_point_expected(work: WorkPoint) -> tuple[ExpectedError, float]:
-    """The error at the work point in words, and in mm."""
+    """Return the error at the work point in words, and in mm."""
     x, y, z = work.p_B_mm
     place = f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base"
     what = "error at the work point, 95 %"
@@ -390,7 +390,7 @@ def check_limit(limit_mm: float | None) -> None:
 
 
 def refused_note(refused: Sequence[tuple[str, str]], n: int, what: str = "scans") -> tuple[str, ...]:
-    """A sentence on what was not used, of ``n`` in all; none where all were used."""
+    """Return a sentence on what was not used, of ``n`` in all; none where all were used."""
     if not refused:
         return ()
     names = ", ".join(name for name, _ in refused[:4]) + (" ..." if len(refused) > 4 else "")
@@ -407,10 +407,10 @@ def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def first_sentence(text: str) -> str:
-    """The text up to the end of its first sentence."""
+    """Return the text up to the end of its first sentence."""
     return re.split(r"(?<=[.!?])\s+(?=[A-Z])", text.strip(), maxsplit=1)[0]
 
 
 def upper(text: str) -> str:
-    """The text with a capital first letter."""
+    """Return the text with a capital first letter."""
     return text[:1].upper() + text[1:]

@@ -79,7 +79,7 @@ class FleetCell:
         return float(1e3 * np.linalg.norm(moved[:3] - p_B))
 
     def document(self) -> dict[str, object]:
-        """The JSON object of the cell."""
+        """Return the JSON object of the cell."""
         return {
             "cell": self.name,
             "state": self.state,
@@ -107,7 +107,7 @@ class FleetReport:
         return [cell.name for cell in self.cells if cell.state == state]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `fleet`."""
+        """Return the JSON object of `fleet`."""
         return {
             "state": "done",
             "cells": len(self.cells),
@@ -128,7 +128,7 @@ WIDTH, HEIGHT, EDGE = 120.0, 28.0, 3.0
 
 
 def fleet_report(report: FleetReport, folder: str) -> str:
-    """The whole page as one HTML text; it links to the reports of the datasets beside it."""
+    """Return the whole page as one HTML text; it links to the reports of the datasets beside it."""
     visit, look = report.named(VISIT), report.named(LOOK)
     summary = report.summary()
     return render(

@@ -55,7 +55,7 @@ class HandEyeReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. Pose pairs have no work point: the held-out error at the target stands in its place."""
+        """Return the first screen. Pose pairs have no work point: the held-out error at the target takes its place."""
         r = self.result
         expected, p95, n = held_out_error(r)
         tolerance = limit_tolerance(expected.what, p95, self.limit_mm)
@@ -68,14 +68,14 @@ class HandEyeReport:
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
         after = (
-            Next(f"To know it better, add a pose. {self.advice}")
+            Next(f"To reduce the uncertainty, add a pose. {self.advice}")
             if self.advice
             else Next("Compare with poses that were not in the file: the target must stay where the result puts it.")
         )
         return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of the command."""
+        """Return the JSON object of the command."""
         r, used = self.result, held_out_used(self.result)
         out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
         for k, X in r.poses.items():
@@ -184,7 +184,7 @@ def _sigmas(values: Array, certain: float) -> str:
 
 
 def held_out_used(r: HandEyeResult) -> HandEyeHeldOut:
-    """The held-out errors of the samples that were used."""
+    """Return the held-out errors of the samples that were used."""
     return HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
 
 
@@ -198,7 +198,7 @@ def held_out_set(r: HandEyeResult) -> str:
 
 
 def repeat_note(r: HandEyeResult) -> list[str]:
-    """A sentence where samples repeat poses."""
+    """Return a sentence where samples repeat poses."""
     n, poses = len(r.observation), int(r.observation.max()) + 1
     if n == poses:
         return []
@@ -234,7 +234,7 @@ def held_out_error(r: HandEyeResult) -> tuple[ExpectedError, float, int]:
 
 
 def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
-    """The poses that were solved for, with their frames in words."""
+    """Return the poses that were solved for, with their frames in words."""
     return tuple(
         ShownPose(u.symbol, f"pose of the {u.child_words} in the {u.parent_words} frame", X)
         for u, X in ((mounting.unknowns[k], X) for k, X in r.poses.items())
@@ -242,7 +242,7 @@ def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
 
 
 def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
-    """The whole report as one self-contained HTML text; ``digest`` is the SHA-256 of the file."""
+    """Return the whole report as one self-contained HTML text; ``digest`` is the SHA-256 of the file."""
     r, m = report.result, report.mounting
     names = [str(k) for k in range(len(r.inliers))]
     held, turned = 1e3 * r.held_out.translation, np.degrees(r.held_out.rotation_rad)

@@ -120,7 +120,7 @@ class MonitorReport:
         return WARMED if self.watched.events else CALM
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object of `monitor`; drift and what it is measured by stand last."""
+        """Return the JSON object of `monitor`; drift and what it is measured by stand last."""
         w = self.watched
         clock = w.clock
         delay = clock.delay_s
@@ -176,7 +176,7 @@ def drift_document(e: DriftEvent) -> dict[str, Any]:
 
 
 def _kind(reason: str) -> str:
-    """A reason without its figures: what comes before a colon, a semicolon or a number."""
+    """Return a reason without its figures: what comes before a colon, a semicolon or a number."""
     return re.split(r"[:;]|\s-?\d", reason)[0].rstrip(". ") + "."
 
 
@@ -190,7 +190,7 @@ _SMOOTH = 21  # frames of a running median
 
 
 def monitor_page(report: MonitorReport, *, recording: str) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     w, summary = report.watched, report.summary()
     t = w.rows.times
     return render(
@@ -247,7 +247,7 @@ def _errors(
 
 
 def _offset(report: MonitorReport) -> bytes:
-    """By how much frames were later than their clock says, as their own residual tells it."""
+    """Return by how much frames were later than their clock says, by their own residual."""
     w = report.watched
     figure, axes = subplots(8.2, 2.5)
     t = w.rows.times

@@ -147,7 +147,7 @@ def motion_screen(
     against: Sequence[str] = (),
     no_tolerance: str = NO_TOLERANCE,
 ) -> FirstScreen:
-    """The first screen of a calibration in motion; ``p_C`` (n, 3) m are the centres of all its frames."""
+    """Return the first screen of a calibration in motion; ``p_C`` (n, 3) m are the centres of all its frames."""
     used, held = e.inliers, 1e3 * e.held_out_m[e.inliers]
     held = held[np.isfinite(held)]
     middle = np.asarray(p_C[used].mean(axis=0))
@@ -180,7 +180,7 @@ def motion_screen(
 
 
 def motion_report(report: MotionReport, *, dataset: str) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     r, e = report.result, report.estimate
     clock = e.clock
     before, after = report.along_rms_mm

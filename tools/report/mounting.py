@@ -160,7 +160,7 @@ class MountingReport:
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         after = "Use the pose; calibrate again after the scanner was moved."
         if status.next_best is not None:
-            after = f"To know it better, add the pose {status.next_best.sentence()}"
+            after = f"To reduce the uncertainty, add the pose {status.next_best.sentence()}"
         elif tolerance is not None and not tolerance.met:
             after = "Add poses that are turned more and lie farther apart, and calibrate again."
         return FirstScreen(found, expected, Next(after), shown_poses(result, self.mounting))
@@ -204,7 +204,7 @@ class MountingReport:
         return 1e3 * float(np.linalg.norm(self.result.place(device.measured(p)) - truth @ p))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: the keys of hand-eye and those of the run."""
+        """Return the JSON object: the keys of hand-eye and those of the run."""
         status, result = self.status, self.result
         out: dict[str, object] = {"state": self.state, "configuration": self.mounting.name, "robot": self.robot}
         if self.reason:
@@ -240,7 +240,7 @@ class MountingReport:
         return out | ({} if self.run is None else self.run.timing()) | {"seconds": self.seconds}
 
     def given(self) -> tuple[str, ...]:
-        """The given data: the pose of the circle, and the link that carries the scanner."""
+        """Return the given data: the pose of the circle, and the link that carries the scanner."""
         scene = self.scene
         out = []
         for letter in scene.known:
@@ -252,7 +252,7 @@ class MountingReport:
         return tuple(out)
 
     def text(self) -> str:
-        """The printed result: directions, sketch, numbers, and the errors at held-out poses."""
+        """Return the printed result: directions, sketch, numbers, and the errors at held-out poses."""
         status = self.status
         if self.result is None:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
@@ -319,7 +319,7 @@ class RecordedMounting(MountingReport):
 
 
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     status, mounting, result = report.status, report.mounting, report.result
     aside = np.array([1e3 * k.error_m for k in status.held_out])
     off = {
@@ -440,7 +440,7 @@ def true_frames(report: MountingReport, q: Array, q_2: Array | None) -> dict[str
 
 
 def _best_view(frames: dict[str, RigidTransform]) -> RigidTransform:
-    """A view from above of all frames, in which the nearest two of them are farthest apart."""
+    """Return a view from above of all frames, in which the nearest two of them are farthest apart."""
     points = np.array([X.translation() for X in frames.values()])
     distinct = points[[all(np.linalg.norm(p - o) > 0.03 for o in points[:i]) for i, p in enumerate(points)]]
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0)) + np.array([0.0, 0.0, 0.05])

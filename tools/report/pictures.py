@@ -111,7 +111,7 @@ _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good s
 
 
 def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) -> bytes:
-    """Each scan's points (N, 3) m of C about its flange, seen along the found normal, with the found edges; PNG.
+    """Draw each scan's points (N, 3) m of C about its flange, along the found normal, with the found edges; PNG.
 
     Colours: height above the found face. The first MOST_SCANS scans are drawn.
     """
@@ -164,7 +164,7 @@ def plain(axes: Axes, x: str, y: str) -> None:
 
 
 def svg(figure: Figure, *all_axes: Axes) -> bytes:
-    """The figure as SVG, the same bytes for the same data."""
+    """Return the figure as SVG, the same bytes for the same data."""
     for axes in all_axes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e6e9", linewidth=0.8)

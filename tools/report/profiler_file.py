@@ -108,7 +108,7 @@ class ProfilerFile:
         if after:
             p, w = 1e3 * np.array(after["poses"][0][:3]), after["poses"][0][3:]
             return Next(
-                f"To know it better, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm, rotation"
+                f"To reduce the uncertainty, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm, rotation"
                 f" vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
             )
         return Next(
@@ -161,7 +161,7 @@ class ProfilerSeam:
 
 
 def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Sentences on scans that were not used: those that put the result in doubt, and the others."""
+    """Return sentences on scans that were not used: those that question the result, and the others."""
 
     def said(words: Mapping[str, str]) -> list[str]:
         return [text.format(n=len(found[key]), all=found["scans"]) for key, text in words.items() if found.get(key)]
@@ -170,7 +170,7 @@ def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:
 
 
 def profiler_report(made: ProfilerFile) -> str:
-    """The page of a calibration from a file, as one self-contained HTML text."""
+    """Return the page of a calibration from a file, as one self-contained HTML text."""
     held = made.held_out_mm
     judged = bool(np.isfinite(held).any())
     return render(
@@ -194,7 +194,7 @@ def profiler_report(made: ProfilerFile) -> str:
 
 
 def seam_report(seam: ProfilerSeam) -> str:
-    """The page of a mapped seam, as one self-contained HTML text."""
+    """Return the page of a mapped seam, as one self-contained HTML text."""
     return render(
         "profiler_file.html.j2",
         first=seam.first,
@@ -240,7 +240,7 @@ def _seen(points: Array) -> bytes:
 
 
 def _line(root_mm: Array) -> bytes:
-    """The root (n, 3) mm of a groove in the base, from above and from the side."""
+    """Return the root (n, 3) mm of a groove in the base, from above and from the side."""
     figure, both = subplots(8.2, 3.6, 1, 2)
     for axes, (i, j), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         axes.plot(root_mm[:, i], root_mm[:, j], ".", color=OURS, markersize=4)

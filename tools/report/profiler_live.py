@@ -239,7 +239,7 @@ class ProfilerLive:
         return FirstScreen(found_all, expected, after, tuple(poses), more)
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `profiler live`, and of `demo` for such a scenario."""
+        """Return the JSON object of `profiler live`, and of `demo` for such a scenario."""
         s, o = self.state, self.outcome
         done = not self.run.held
         found: dict[str, object] = {"state": "done" if done else "held", "scenario": self.options.scenario}
@@ -343,7 +343,7 @@ def live_report(
 def seeds_report(
     found: Mapping[str, object], rows: Sequence[Mapping[str, object]], outcomes: Sequence[LiveOutcome], first_seed: int
 ) -> str:
-    """The page of many seeds."""
+    """Return the page of many seeds."""
     poses = {n: [p for o in outcomes if (p := getattr(o, n)) is not None] for n in ("edge", "sphere")}
     poses = {n: p for n, p in poses.items() if p}
     followed = [(first_seed + k, o.torch) for k, o in enumerate(outcomes) if o.torch is not None]

@@ -21,7 +21,7 @@ _OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*)")
 
 
 def render(template: str, **context: object) -> str:
-    """The HTML of a template of this folder.
+    """Return the HTML of a template of this folder.
 
     Everything from the context is escaped; a name that the template uses and the context lacks is an error. Pictures
     are handed over as bytes (PNG, JPEG or SVG) and end inside the page, so that it needs no other file and no network.
@@ -37,19 +37,19 @@ def render(template: str, **context: object) -> str:
 
 
 def optioned(text: str) -> Markup:
-    """The escaped text, with options of the command line (--limit-mm) that are not broken at their hyphens."""
+    """Return the escaped text, with options of the command line (--limit-mm) that are not broken at their hyphens."""
     return Markup(_OPTION.sub(r'<span class="option">\1</span>', str(escape(text))))
 
 
 def inlined(picture: bytes, alt: str) -> Markup:
-    """The picture as a part of the page: an SVG in the colours of the page, any other picture as an image."""
+    """Return the picture as a part of the page: an SVG in the colours of the page, any other picture as an image."""
     if b"<svg" in picture[:1024]:
         return inline_svg(picture.decode(), alt)
     return Markup('<img src="{}" alt="{}">').format(data_uri(picture), alt)
 
 
 def data_uri(picture: bytes) -> str:
-    """The picture as the text of a data: address.
+    """Return the picture as the text of a data: address.
 
     Raises:
         ValueError: if it is neither PNG, JPEG nor SVG.
@@ -62,7 +62,7 @@ def data_uri(picture: bytes) -> str:
 
 
 def fixed(value: float | None, digits: int = 2) -> str:
-    """The number with that many decimals; a dash for None and NaN, the sign ∞ for an infinite one."""
+    """Return the number with that many decimals; a dash for None and NaN, the sign ∞ for an infinite one."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -92,12 +92,12 @@ def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]
 
 
 def known(value: float) -> float | None:
-    """The number for a JSON object; None where it is not finite."""
+    """Return the number for a JSON object; None where it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def sigma_rows(covariance: Array) -> list[tuple[str, str]]:
-    """The two rows of one sigma of a pose with covariance (6, 6) [rotation; translation], rad and m."""
+    """Return the two rows of one sigma of a pose with covariance (6, 6) [rotation; translation], rad and m."""
     sigma = np.sqrt(np.diag(covariance))
     return [
         ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
@@ -138,7 +138,7 @@ def _script(reports: Environment) -> Markup:
 
 @pass_environment
 def _script_hash(reports: Environment) -> str:
-    """The script's name in the page's policy: no other script runs in it."""
+    """Return the script's name in the page's policy: no other script runs in it."""
     digest = hashlib.sha256(_script(reports).encode()).digest()
     return f"sha256-{base64.b64encode(digest).decode('ascii')}"
 
@@ -178,7 +178,7 @@ def inline_svg(svg: str, alt: str) -> Markup:
 
 
 def _opening(attributes: str, alt: str) -> str:
-    """The svg element: as wide as its box, named for who cannot see it."""
+    """Return the svg element: as wide as its box, named for who cannot see it."""
     size = re.search(r'viewBox="[\d.]+ [\d.]+ ([\d.]+) ([\d.]+)"', attributes)
     ratio = float(size[2]) / float(size[1]) if size else 0.0
     shape = " tall" if ratio > TALL else " high" if ratio > HIGH else ""

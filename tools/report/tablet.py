@@ -157,7 +157,7 @@ class Page:
 
 
 def marked_picture(grey: NDArray[np.uint8], uv_px: Array) -> bytes:
-    """The image (h, w) as PNG with a numbered mark at each landmark (n, 2) px."""
+    """Return the image (h, w) as PNG with a numbered mark at each landmark (n, 2) px."""
     image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     size = max(grey.shape[1] / 640.0, 1.0)
     for k, (u, v) in enumerate(uv_px):
@@ -205,7 +205,7 @@ def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str
 def calibration_report(
     result: TabletResult, shown: Shown, first: FirstScreen, seconds: float, held_out: Mapping[str, float] | None = None
 ) -> str:
-    """The page of `weldcal tablet calibrate`."""
+    """Return the page of `weldcal tablet calibrate`."""
     left = [v for v in result.leave_one_out_mm if v is not None]
     mean = float(np.mean(left)) if left else float("nan")
     header, rows = landmark_rows(result, shown.names)
@@ -245,7 +245,7 @@ def visit_report(
     first: FirstScreen,
     recording: bool,
 ) -> str:
-    """The page of a run in a scenario; `result` and `shown` are None if it was held before its end."""
+    """Return the page of a run in a scenario; `result` and `shown` are None if it was held before its end."""
     scenario, job, name = run.cell.scenario, run.cell.job, str(found["scenario"])
     subtitle = f"{scenario.description.rstrip('.')}. " if scenario.description else ""
     robot = "Simulation" if found["robot"] == "simulated" else f"Rendered sensors; robot: {found['robot']}"

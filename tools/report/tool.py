@@ -46,7 +46,7 @@ class ToolCheck:
         return [r.name for r in ROBOTS.values() if r.name.startswith("ur") and r.payload_kg >= self.loaded.tool.mass_kg]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: millimetres and degrees, poses in the flange frame."""
+        """Return the JSON object: millimetres and degrees, poses in the flange frame."""
         t, camera = self.loaded.tool, self.loaded.camera
         far_mm = 1e3 * float(np.linalg.norm(t.X_KM_rest.translation()))
         side_px = float(np.linalg.norm(self.tag_px[1] - self.tag_px[0]))
@@ -163,7 +163,7 @@ matplotlib.use("Agg")
 
 
 def tool_report(check: ToolCheck, picture: bytes) -> str:
-    """The page of a tool as one self-contained HTML text."""
+    """Return the page of a tool as one self-contained HTML text."""
     return render(
         "tool.html.j2",
         name=check.loaded.name,

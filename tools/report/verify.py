@@ -129,7 +129,7 @@ class VerifyReport:
 
     @property
     def tilt_deg(self) -> dict[str, float | None]:
-        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
+        """Return median and 95th percentile of the tilt, deg; None without a normal."""
         found = statistics(np.array([p.tilt_deg for p in self.poses], dtype=float))
         return {key: known(found[key]) for key in ("median", "p95")}
 
@@ -148,7 +148,7 @@ class VerifyReport:
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     ids = [p.id for p in report.poses]
     fresh = np.array([not p.used_before for p in report.poses])
     median_of = "of the new scans " if fresh.any() and not fresh.all() else ""
@@ -285,7 +285,7 @@ class TouchReport:
         return rows
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `verify --touch`."""
+        """Return the JSON object of `verify --touch`."""
         f, v = self.found, self.verdict
         rows = zip(
             f.ids,
@@ -323,7 +323,7 @@ class TouchReport:
 
 
 def touch_page(report: TouchReport, source: str) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     f = report.found
     errors = 1e3 * np.abs(f.error_m)
     rows = [

@@ -154,7 +154,7 @@ class PairsReport:
         return Next("Record pairs with larger and more varied turns of the robot, and verify with them.")
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of the command."""
+        """Return the JSON object of the command."""
         j = self.judgement
         return {
             "state": "done",
@@ -211,7 +211,7 @@ class PairsReport:
 
 
 def verify_pairs_report(report: PairsReport) -> str:
-    """The whole report as one self-contained HTML text."""
+    """Return the whole report as one self-contained HTML text."""
     j = report.judgement
     rows = [(i, "used" if u else "outlier", *(fixed(v, 4) for v in row)) for i, u, *row in report._columns()]
     return render(

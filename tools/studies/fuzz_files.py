@@ -54,7 +54,7 @@ class FuzzResult:
     seed: int
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object."""
+        """Return the JSON object."""
         total = sum(self.counts.values(), Counter())
         bad = {f.reader: f for f in reversed(self.findings)}
         first = next(iter(self.findings), None)

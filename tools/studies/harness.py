@@ -1,4 +1,4 @@
-"""Runs every study in one way: cases on workers, figures, targets with verdicts, tables, and the files of its result.
+"""Run every study alike: cases on workers, figures, targets with verdicts, tables, and the files of its result.
 
 A study is one frozen description in its own module, and the command that runs it:
 
@@ -42,7 +42,7 @@ _STYLES = {"met": "[green]met[/]", "MISSED": "[bold red]MISSED[/]"}
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown, with a newline at its end."""
+    """Return a table in Markdown, with a newline at its end."""
     lines = [header, *rows]
     text = [f"| {' | '.join(line)} |\n" for line in lines]
     return "".join([text[0], f"|{'---|' * len(header)}\n", *text[1:]])
@@ -111,12 +111,12 @@ class Target(NamedTuple):
 
 
 def verdict(met: bool) -> str:
-    """The word for a target that is met or missed."""
+    """Return the word for a target that is met or missed."""
     return "met" if met else "MISSED"
 
 
 def all_met(targets: Iterable[Target]) -> bool:
-    """Whether every target that decides is met."""
+    """Return whether every target that decides is met."""
     return all(t.met for t in targets if t.decides)
 
 
@@ -205,7 +205,7 @@ class Study:
         return self.measured({"all": dict(figures)}, folder).outcome()
 
     def measured(self, results: Results, folder: Path | None = None, cases: Cases | None = None) -> "Measured":
-        """The figures, the table and the verdicts of results; with a folder their files are written there."""
+        """Return the figures, the table and the verdicts of results; with a folder their files are written there."""
         figures = self.figures(results)
         found = Measured(
             study=self,
@@ -267,7 +267,7 @@ class Measured:
         return self.study.group == "reproduce" and not self.met
 
     def markdown(self) -> str:
-        """The tables, and below them the targets where the study has some."""
+        """Return the tables, and below them the targets where the study has some."""
         return "\n".join(
             (f"**{title}**\n\n" if k else "") + markdown_table(header, rows)
             for k, (title, header, rows) in enumerate(self._shown)
@@ -305,8 +305,8 @@ class Measured:
 
 
 def command_line() -> str:
-    """The arguments of this program as a user types them, without the output folder."""
-    words = sys.argv[1:]
+    """Return the arguments of this program as a user types them, without the output folder."""
+    words = ["dev", *sys.argv[1 + (sys.argv[1:2] == ["dev"]) :]]
     if "--out" in words:
         k = words.index("--out")
         words = words[:k] + words[k + 2 :]
@@ -314,12 +314,12 @@ def command_line() -> str:
 
 
 def done(results: Results) -> list[Result]:
-    """The results of the cases that were not refused."""
+    """Return the results of the cases that were not refused."""
     return [r for r in results.values() if r.get("state") != FAILED]
 
 
 def whole(results: Results) -> Results:
-    """The results of a study that needs every case.
+    """Return the results of a study that needs every case.
 
     Raises:
         InputError: a case was refused.

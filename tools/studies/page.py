@@ -14,7 +14,7 @@ from weldcal.tools.studies.harness import TABLE, markdown_table
 PAGE = "BENCHMARK.md"
 HEAD = """# Measured figures
 
-`weldcal benchmark page` wrote this page from the results of the studies. Each section has the command that measured it.
+`weldcal dev benchmark page` wrote this page from the results of the studies. Each section has its command.
 The sizes (`--runs`, `--quick` and similar) are in that command. A larger size gives narrower figures. Times are of the
 machine that ran it.
 
@@ -35,20 +35,25 @@ def page(
     if not studies:
         raise InputError(f"'{results[0]}' holds no result of a study. Run one with --out, then give its folder.")
     folder = call.folder("benchmark", "page")
-    studies.sort(key=lambda study: (study["command"].split()[1], study["study"]))
+    studies.sort(key=lambda study: (_group(study), study["study"]))
     write_atomic(folder / PAGE, HEAD + "\n".join(map(_section, studies)))
     return Outcome({"state": "done", "studies": [study["study"] for study in studies], "page": str(folder / PAGE)})
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """A study's table.json; None for a file that is another command's."""
+    """Return a study's table.json; None for a file that is another command's."""
     content = json.loads(path.read_text(encoding="utf-8"))
     return content if isinstance(content, dict) and {"study", "tables", "command"} <= set(content) else None
 
 
+def _group(study: dict[str, Any]) -> str:
+    """Whether the study is of `benchmark` or of `reproduce`."""
+    return str(next(word for word in study["command"].split()[1:] if word != "dev"))
+
+
 def _section(study: dict[str, Any]) -> str:
     lines = [
-        f"## {study['command'].split()[1]} {study['study']}\n",
+        f"## {_group(study)} {study['study']}\n",
         f"{study['what']}\n",
         f"Command: `{study['command']}`\n",
         f"Measured on {study['measured_on']} with {study['software']}.\n",

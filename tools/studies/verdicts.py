@@ -19,7 +19,7 @@ CLEAN_SEEDS = 10_000  # sets without a cause have seeds of their own
 
 
 def named_first(cause: str, seed: int) -> Mapping[str, object]:
-    """The cause that the doctor names first in one set; ``cause`` none: a set without."""
+    """Return the cause that the doctor names first in one set; ``cause`` none: a set without."""
     report = worded("a made set", diagnose(clean(CLEAN_SEEDS + seed) if cause == NONE else CAUSES[cause](seed)))
     return {"cause": cause, "seed": seed, "named": report.causes[0].name if report.causes else NONE}
 

@@ -96,7 +96,7 @@ def _frames(chain: Chain, q: Array) -> list[Array]:
 
 
 def _tube(a: Array, b: Array, radius: float) -> TriMesh:
-    """A closed cylinder from a to b (3,) m."""
+    """Return a closed cylinder from a to b (3,) m."""
     d = b - a
     length = float(np.linalg.norm(d))
     mesh = revolve(np.array([(0.0, 0.0), (radius, 0.0), (radius, length), (0.0, length)]), 48)
@@ -148,7 +148,7 @@ def _placed(mesh: TriMesh, X: Array) -> TriMesh:
 
 
 def posed(links: list[TriMesh], flange: TriMesh, frames: list[Array]) -> TriMesh:
-    """The whole arm at these frames, in B."""
+    """Return the whole arm at these frames, in B."""
     return merge(*(_placed(m, X) for m, X in zip(links, frames[:-1], strict=True)), _placed(flange, frames[-1]))
 
 
@@ -202,7 +202,7 @@ def render(mesh: TriMesh, X_BC: RigidTransform, rng: np.random.Generator, sigma:
 
 
 def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
-    """The cell of a seed: arm by turns, the scanner 0.6 to 1.7 m from where the flange is scanned."""
+    """Return the cell of a seed: arm by turns, the scanner 0.6 to 1.7 m from where the flange is scanned."""
     rng = np.random.default_rng([seed, 41])
     name = ARMS[seed % len(ARMS)]
     chain, reach = load_chain(name), REACH_M[name]
@@ -277,7 +277,7 @@ def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
 
 
 def calibrate_cell(seed: int) -> Mapping[str, object]:
-    """The cell of a seed calibrated without a guess, and the start from three of its scans.
+    """Return the cell of a seed calibrated without a guess, and the start from three of its scans.
 
     "right", "wrong" or "refused" each; "alone" is what it is without the arm.
     """

@@ -70,7 +70,7 @@ class BoardWorld:
 
 @lru_cache(maxsize=8)
 def printed(text: str) -> Drawing:
-    """The board that a string describes, as it is printed on A3."""
+    """Return the board that a string describes, as it is printed on A3."""
     sheet, board = described_sheet(parse_board(text), "A3"), parse_board(text)
     image: Any = np.full((round(sheet.height * PX_PER_MM), round(sheet.width * PX_PER_MM)), 245, np.uint8)
     corners: list[tuple[float, float]] = []
@@ -109,7 +109,7 @@ def _rays() -> tuple[Any, Any]:
 
 
 def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture of a drawing under its pose C (m)."""
+    """Return the picture of a drawing under its pose C (m)."""
     x, y = _rays()
     H = np.linalg.inv(C[:3, [0, 1, 3]]).astype(np.float32)  # rays to points of the plane
     p = [H[k, 0] * x + H[k, 1] * y + H[k, 2] for k in range(3)]

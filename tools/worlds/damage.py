@@ -176,7 +176,7 @@ def _yaml_bomb(rng: Rng) -> bytes:
 
 
 def json_text(content: bytes, rng: Rng) -> Damage:
-    """A tree with a value of another type, ragged lists, missing or doubled keys; or text that ends early."""
+    """Return a tree with a value of another type, ragged lists, missing or doubled keys; or text that ends early."""
     kind = int(rng.integers(6))
     if kind == 0:
         return content[: int(rng.integers(len(content)))], True
@@ -365,7 +365,7 @@ def matlab(content: bytes, rng: Rng) -> Damage:
 
 
 def npy(content: bytes, rng: Rng) -> Damage:
-    """A lying header, a cut body, Python objects."""
+    """Return a lying header, a cut body, Python objects."""
     kind = int(rng.integers(4))
     if kind == 0:
         return content[: int(rng.integers(len(content)))], True
@@ -377,7 +377,7 @@ def npy(content: bytes, rng: Rng) -> Damage:
 
 
 def _zip(members: dict[str, bytes], rng: Rng, again: str | None = None) -> bytes:
-    """A zip of the members; ``again``: one that stands there a second time, with another last byte."""
+    """Return a zip of the members; ``again``: one that is there a second time, with another last byte."""
     stream = io.BytesIO()
     method = zipfile.ZIP_DEFLATED if rng.random() < 0.5 else zipfile.ZIP_STORED
     with zipfile.ZipFile(stream, "w", method) as archive, warnings.catch_warnings():
@@ -390,7 +390,7 @@ def _zip(members: dict[str, bytes], rng: Rng, again: str | None = None) -> bytes
 
 
 def _lying(body: bytes, rng: Rng) -> bytes:
-    """An npy whose header promises more than there is, of the same length."""
+    """Return an npy whose header promises more than there is, of the same length."""
     found = re.search(rb"'shape': \(([^)]*)\)", body[:256])
     if found is None:
         return body[:-1]
@@ -421,7 +421,7 @@ def _objects(value: np.ndarray) -> bytes:
 
 @cache
 def _npz_bomb(name: str) -> bytes:
-    """An npz of a few MB with one array, as large as all its headers say: 2.4 GB of zeros."""
+    """Return an npz of a few MB with one array, as large as all its headers say: 2.4 GB of zeros."""
     numbers = 300_000_000
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (numbers // 3, 3)})
@@ -437,13 +437,13 @@ def _npz_bomb(name: str) -> bytes:
 
 
 def _deflated(content: bytes) -> bytes:
-    """A piece of a raw deflate stream that may stand anywhere in it."""
+    """Return a piece of a raw deflate stream that may stand anywhere in it."""
     squeeze = zlib.compressobj(9, zlib.DEFLATED, -15)
     return squeeze.compress(content) + squeeze.flush(zlib.Z_FULL_FLUSH)
 
 
 def image(content: bytes, rng: Rng) -> Damage:
-    """A PNG that promises more pixels, with a right checksum; else bytes of any kind."""
+    """Return a PNG that promises more pixels, with a right checksum; else bytes of any kind."""
     if content.startswith(b"\x89PNG") and rng.random() < 0.4:
         size = struct.pack(">II", *(int(v) for v in rng.choice([0, 1, 24, 30_000, 2**31 - 1], size=2)))
         chunk = b"IHDR" + size + content[24:29]

@@ -198,7 +198,7 @@ READERS = (
 
 
 def all_finite(value: Any) -> bool:
-    """Whether all numbers of what was read are finite."""
+    """Return whether all numbers of what was read are finite."""
     if isinstance(value, dict):
         return all(all_finite(v) for v in value.values())
     if isinstance(value, list | tuple):
@@ -305,7 +305,7 @@ def _read(reader: Reader, folder: Path) -> tuple[ReaderVerdict, Any]:
 
 
 def digest(values: Any) -> str:
-    """A hash of what was read."""
+    """Return a hash of what was read."""
     return sha256(pickle.dumps(values)).hexdigest()
 
 
@@ -330,7 +330,7 @@ class Child:
         self._end()
 
     def ask(self, reader: Reader, seed: int, case: int) -> tuple[ReaderVerdict, float]:
-        """The verdict of a case, and how many seconds it took with making its files."""
+        """Return the verdict of a case, and how many seconds it took with making its files."""
         limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
         process = self._process or self._start()
         assert process.stdin is not None
@@ -367,7 +367,7 @@ class Child:
         return self._process
 
     def _line(self, process: subprocess.Popen[str], limit: float) -> str | None:
-        """The next line of the worker; None where none comes in time, or the worker ends."""
+        """Return the next line of the worker; None where none comes in time, or the worker ends."""
         assert process.stdout is not None
         with selectors.DefaultSelector() as selector:
             selector.register(process.stdout, selectors.EVENT_READ)
@@ -408,12 +408,12 @@ def main() -> None:
 
 
 def too_much(taken: int, size: int) -> bool:
-    """Whether a case took more bytes than files of so many bytes may."""
+    """Return whether a case took more bytes than files of so many bytes may."""
     return taken > FREE + TIMES * size
 
 
 def _peak() -> int:
-    """The largest resident size so far, bytes."""
+    """Return the largest resident size so far, bytes."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 

@@ -45,7 +45,7 @@ class DoctorWorld:
 
 
 def make_world(seed: int, *, alike: bool = False) -> DoctorWorld:
-    """A cell of its own for each seed: arm, scanner place, and 10 to 20 poses in front of the scanner."""
+    """Return a cell of its own for each seed: arm, scanner place, and 10 to 20 poses in front of the scanner."""
     rng = np.random.default_rng([seed, 18])
     name = ARMS[int(rng.integers(len(ARMS)))]
     reach = 1.0 if name == "ur10e" else 0.72
@@ -161,7 +161,7 @@ def true_poses(world: DoctorWorld) -> Array:
 
 
 def clean(seed: int) -> DoctorCase:
-    """A set without a cause."""
+    """Return a set without a cause."""
     world = make_world(seed)
     return observe(world, true_poses(world))
 

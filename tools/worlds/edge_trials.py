@@ -73,34 +73,34 @@ class EdgeTrial:
     wrong: NDArray[np.bool_] | None = None
 
     def first(self, count: int) -> EdgeTrial:
-        """The trial with its first poses only."""
+        """Return the trial with its first poses only."""
         return replace(self, poses=self.poses[slice(0, count)], points=self.points[:count])
 
     def joint(self, init: EdgeState | None = None) -> EdgeEstimate:
-        """The joint method's calibration."""
+        """Return the joint method's calibration."""
         X, noise = self.poses, self.noise
         return edge_joint(
             X.rotation, X.translation, self.points, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m, init=init
         )
 
     def paper(self) -> EdgeLinear:
-        """The calibration by the paper's method."""
+        """Return the calibration by the paper's method."""
         group = np.repeat(np.arange(len(self.poses) // TRANSLATIONS), TRANSLATIONS)
         return edge_linear(self.poses.rotation, self.poses.translation, self.points, group)
 
     def crb(self) -> Floats:
-        """The Cramer-Rao bound (6, 6) of a calibration from the poses that are no outliers."""
+        """Return the Cramer-Rao bound (6, 6) of a calibration from the poses that are no outliers."""
         X = self.poses if self.wrong is None else self.poses[~self.wrong]
         return edge_crb(
             self.truth, X.rotation, X.translation, sigma_robot_m=self.noise.robot_m, sigma_xz_m=self.noise.xz_m
         )
 
     def bound(self) -> EdgeError:
-        """The Cramer-Rao bound, as standard deviations of rotation and translation."""
+        """Return the Cramer-Rao bound, as standard deviations of rotation and translation."""
         return sigma_of(self.crb())
 
     def error(self, rotation: Floats, translation: Floats, covariance: Floats | None = None) -> EdgeError:
-        """The error of a calibration."""
+        """Return the error of a calibration."""
         turn = Rotation.from_matrix(self.truth.rotation @ rotation.T).as_rotvec()
         off = np.concatenate([turn, self.truth.translation - translation])
         nees = np.nan if covariance is None else float(off @ np.linalg.solve(covariance, off))

@@ -101,7 +101,7 @@ def text_cloud(rng: Rng) -> Files:
 
 
 def npz(arrays: Mapping[str, Any], compressed: bool = False) -> bytes:
-    """The bytes of an npz of these arrays."""
+    """Return the bytes of an npz of these arrays."""
     stream = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(stream, **arrays)
     return stream.getvalue()
@@ -139,7 +139,7 @@ def _poses(rng: Rng, n: int) -> Array:
 
 
 def dataset(rng: Rng) -> Files:
-    """A folder of three scans, with a feature and a guess in its header."""
+    """Return a folder of three scans, with a feature and a guess in its header."""
     poses = _poses(rng, 3)
     header = DATASET + "feature_in_flange: {xyz: [0.14, 0.0, -0.012], wxyz: [0.0, 1.0, 0.0, 0.0]}\n"
     header += (
@@ -151,7 +151,7 @@ def dataset(rng: Rng) -> Files:
 
 
 def pairs(rng: Rng) -> Files:
-    """A folder of centres found by other means."""
+    """Return a folder of centres found by other means."""
     base, camera = rng.uniform([0.1, -0.5, -0.1], [1.1, 0.5, 0.9], (6, 3)), points(rng, 6)
     turn = Rotation.random(6, rng).as_quat(scalar_first=True)
     names = [*(f"base_{c}" for c in "xyz"), *(f"camera_{c}" for c in "xyz"), *(f"base_q{c}" for c in "wxyz")]
@@ -254,7 +254,7 @@ def hand_eye_lists(rng: Rng) -> tuple[Array, Array]:
 
 
 def hand_eye_npz(rng: Rng) -> Files:
-    """A and B, with the mounting and the unit."""
+    """Return a and B, with the mounting and the unit."""
     F, G = hand_eye_lists(rng)
     return {
         "pairs.npz": npz(
@@ -376,7 +376,7 @@ def profiler_blocks(rng: Rng) -> Files:
 
 
 def profiler_heights(rng: Rng) -> Files:
-    """A grid of heights with the x of its columns in the first row, or of its rows in the first column.
+    """Return a grid of heights with the x of its columns in the first row, or of its rows in the first column.
 
     And their poses.
     """
@@ -437,7 +437,7 @@ def kinematics(rng: Rng) -> Files:
 
 
 def weld_log(rng: Rng) -> Files:
-    """A table of five rows and its header."""
+    """Return a table of five rows and its header."""
     columns = {c.name: rng.normal(size=5) for c in COLUMNS if c.name != "phase"}
     process = WeldProcess("MAG", 180.0, 24.0)
     table, header = weld_log_texts(WeldRecord(columns, np.array(["TRACK"] * 5), process, {"seed": 1}))
@@ -445,7 +445,7 @@ def weld_log(rng: Rng) -> Files:
 
 
 def image(rng: Rng) -> Files:
-    """A small image."""
+    """Return a small image."""
     ending = str(rng.choice([".png", ".jpg", ".bmp"]))
     picture = rng.integers(0, 255, (24, 32), dtype=np.uint8)
     return {"a.png": bytes(cv2.imencode(ending, picture)[1])}

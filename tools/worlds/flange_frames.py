@@ -53,7 +53,7 @@ def facing(p_CR: Array, tilt_rad: float, azimuth_rad: float, turn_rad: float) ->
 def random_place(
     scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, max_tilt_deg: float = 32.0
 ) -> RigidTransform:
-    """A feature pose X_CR in the middle of the working range and wholly inside the image."""
+    """Return a feature pose X_CR in the middle of the working range and wholly inside the image."""
     z = rng.uniform(scanner.near_m + 0.06, min(scanner.far_m - 0.1, 1.5 * scanner.optimum_m))
     margin = 0.5 * standard.outer_m + 0.01
     half = [0.5 * size * z / f - margin for size, f in ((scanner.width, scanner.fx), (scanner.height, scanner.fy))]
@@ -99,7 +99,7 @@ def sphere_frame(
 
 
 def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> FlangeScan:
-    """A frame without the flange.
+    """Return a frame without the flange.
 
     A table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends).
     """
@@ -133,7 +133,7 @@ def fit_frame(frame: FlangeScan, standard: FlangeStandard) -> FrameFit:
 def hidden_frame(
     way: str, scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, share: float = 0.5
 ) -> FlangeScan:
-    """A frame that hides ``share`` of the flange's width in one of the ``WAYS``, from a random side."""
+    """Return a frame that hides ``share`` of the flange's width in one of the ``WAYS``, from a random side."""
     X_CR = random_place(scanner, standard, rng, max_tilt_deg=25.0)
     beyond = (0.5 - share) * standard.outer_m  # from the centre to where the hidden part begins
     azimuth = rng.uniform(0.0, 2.0 * np.pi)
@@ -167,7 +167,7 @@ def _lean(X_CR: RigidTransform, turned: RigidTransform) -> float:
 
 
 def _wrist(standard: FlangeStandard, rng: np.random.Generator) -> list[TriMesh]:
-    """The last links of an arm behind the flange: a housing wider than it, and a tube across."""
+    """Return the last links of an arm behind the flange: a housing wider than it, and a tube across."""
     r, step = standard.outer_radius_m, -_THICK_M + rng.uniform(0.0, 0.005)
     housing = _solid([(1.43 * r, step), (1.43 * r, step - 0.06)])
     across = _solid([(1.3 * r, -0.09), (1.3 * r, 0.09)])
@@ -194,7 +194,7 @@ def _surroundings(
     count: int,
     clear_of: RigidTransform | None,
 ) -> list[TriMesh]:
-    """A table and loose things, none of which stands between the scanner and the flange."""
+    """Return a table and loose things, none of which is between the scanner and the flange."""
     far = scanner.far_m
     while True:
         X_CT = RigidTransform(RollPitchYaw(*rng.uniform(-0.4, 0.4, 2), 0.0), [0.0, 0.0, rng.uniform(0.9, 1.15) * far])
@@ -220,7 +220,7 @@ def _surroundings(
 
 
 def box(x: float, y: float, z: float) -> TriMesh:
-    """A box (m) about its middle."""
+    """Return a box (m) about its middle."""
     corners = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)]) * [x, y, z]
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))]
@@ -241,7 +241,7 @@ def _ball(radius: float, rings: int = 25) -> TriMesh:
 
 
 def _scan(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
-    """The frame that the scanner returns of these bodies."""
+    """Return the frame that the scanner returns of these bodies."""
     scene = make_scene(merge(*bodies))
     rays = np.zeros((scanner.height, scanner.width, 6), dtype=np.float32)
     rays[..., 3] = ((np.arange(scanner.width) - scanner.cx) / scanner.fx)[None, :]

@@ -42,7 +42,7 @@ class PairedPoses:
     """Pairs of one cell.
 
     ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4) and
-    ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``.
+    ``Y`` (4, 4) the truth, which no solver is given. F X G = Y but for the errors of this ``kind``.
     """
 
     kind: str
@@ -116,7 +116,7 @@ def imperfect_cell(kind: str, seed: int) -> PairedPoses:
 def _read(
     true: Array, kind: str, board: Array, true_K: Array, bend: Array, K: Array, pixel: float, rng: np.random.Generator
 ) -> Array | None:
-    """The board's pose as a program estimates it, None where too little of it is in the image."""
+    """Return the board's pose as a program estimates it, None where too little of it is in the image."""
     in_camera = board @ true[:3, :3].T + true[:3, 3]
     if float(in_camera[:, 2].min()) < 0.1:
         return None
@@ -188,10 +188,10 @@ class MistakenPairs:
 
 @dataclass(frozen=True)
 class SolverVerdict:
-    """What the solver said of a world.
+    """Hold the solver's answer on a world.
 
     "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or "NAN" and "WRONG", which must
-    not be; ``nees``: of the answer, in units of the region that holds the truth.
+    not be. ``nees``: of the answer, in units of the region that holds the truth.
     """
 
     said: str
@@ -231,7 +231,7 @@ def random_world(rng: np.random.Generator, mistake: str | None = None) -> Mistak
 
 
 def judge(world: MistakenPairs, config: HandEyeConfig | None = None) -> SolverVerdict:
-    """Solve a world as the command does and judge what it said against the truth."""
+    """Solve a world as the command does and judge the answer against the truth."""
     try:
         result = solve_pairs(world.pairs, config or HandEyeConfig(folds=0))
     except WeldcalError as e:
@@ -378,7 +378,7 @@ def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
 def _written(
     lists: list[Array], rng: np.random.Generator, unit: float, may_change: bool
 ) -> tuple[list[PoseNumbers], str]:
-    """The lists in one random convention, and the form that reads them."""
+    """Return the lists in one random convention, and the form that reads them."""
     change = str(rng.choice(["", "", "transposed", "left_handed"])) if may_change else ""
     kind = str(rng.choice(["vector", "vector", "vector", "quaternion", "matrix"]))
     order, angles, which = (

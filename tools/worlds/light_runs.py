@@ -113,14 +113,14 @@ def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: 
 
 
 def _simulated(scenario: Scenario) -> tuple[SimulatedUr, RenderedScanner]:
-    """The scenario's arm and scanner.
+    """Return the scenario's arm and scanner.
 
     Raises InputError where they are not simulated, or the scanner moves with the arm.
     """
     robot, scanner = scenario.robot, scenario.scanner_config()
     if not isinstance(robot, SimulatedUr) or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
         raise InputError(
-            "This study needs a simulated arm and a scanner that stands in the base: give a scenario with robot:"
+            "This study needs a simulated arm and a scanner that is fixed in the base frame. Give a scenario with robot:"
             " !SimulatedUr and scanner: !RenderedScanner, such as s_groove."
         )
     return robot, scanner
@@ -136,7 +136,7 @@ def _draw(scenario: Scenario, arm: ArmModel, X_FR: RigidTransform, rng: np.rando
 
 
 def _observe(world: _World, q: Array, id: str, rng: np.random.Generator) -> Observation:
-    """The observation at reported joints q (6,) rad."""
+    """Return the observation at reported joints q (6,) rad."""
     sigma = world.repeatability_m / float(np.linalg.norm(jacobian(world.arm, q)[3:]))
     X_CR = world.X_BC.inverse() @ forward_kinematics(world.true_arm, q + sigma * rng.standard_normal(6)) @ world.X_FR
     p, n = _seen(world.device, X_CR, _FACE_M, rng)
@@ -195,7 +195,7 @@ class MountedWorld:
 
 @cache
 def mounted_plan(name: str) -> tuple[Scenario, MountingScene, float, tuple[MountingPose, ...]]:
-    """A mounting's scenario by name, its scene, the radius of its circle's face (m), and the planned poses."""
+    """Return a mounting's scenario by name, its scene, the radius of its circle's face (m), and the planned poses."""
     scenario = load_scenario(name)
     scene, standard = mounting_scene(scenario, load_arm(scenario.arm))
     return scenario, scene, 0.9 * standard.outer_radius_m, plan_mounting(scenario, scene, 0)
@@ -276,7 +276,7 @@ class Redrawn:
 
 
 def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Array) -> Array:
-    """Joints (n, 6) rad in which a bare flange stands where each observation says.
+    """Return joints (n, 6) rad at which a bare flange is where each observation says.
 
     The solution nearest to ``q_home``.
     """
@@ -306,7 +306,7 @@ def redraw(observations: tuple[Observation, ...], station: RedrawnStation, count
 
 
 def joined(parts: list[Redrawn]) -> Redrawn:
-    """All of them together."""
+    """Return all of them together."""
     names = ("at_work_m", "rotation_rad", "bound_at_work_m", "bound_rotation_rad")
     return Redrawn(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
@@ -341,7 +341,7 @@ def _joint_sigma(station: RedrawnStation, J: Array) -> float:
 
 
 def _redrawn(o: Observation, q: Array, station: RedrawnStation, rng: np.random.Generator) -> Observation:
-    """The observation with noise of its own; the robot's reported pose stays."""
+    """Return the observation with noise of its own; the robot's reported pose stays."""
     offset = _joint_sigma(station, jacobian(station.arm, q)) * rng.standard_normal(6)
     X_CR = station.X_BC.inverse() @ forward_kinematics(station.arm, q + offset)
     z = X_CR.rotation().matrix()[:, 2]
@@ -355,7 +355,7 @@ def _redrawn(o: Observation, q: Array, station: RedrawnStation, rng: np.random.G
 
 
 def _in_base(o: Observation) -> Array:
-    """The fit's covariance (3, 3) m^2: along the face's normal and across, whatever way the camera is turned."""
+    """Return the fit's covariance (3, 3) m^2: along the face's normal and across, for any orientation of the camera."""
     assert o.center_covariance is not None
     n = np.asarray(o.n_C) if o.n_C is not None else np.array([0.0, 0.0, -1.0])
     along = float(n @ o.center_covariance @ n)

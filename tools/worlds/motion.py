@@ -69,7 +69,7 @@ class Disturbance:
     warm_up_gradient_per_m: float = 0.0
 
     def world_in_base(self, t: float) -> RigidTransform:
-        """Pose X_BW of what stands still, in the robot's base, at ``t`` s.
+        """Return the pose X_BW of the static surroundings, in the robot's base, at ``t`` s.
 
         The two are one before the base has moved.
         """
@@ -78,7 +78,7 @@ class Disturbance:
         return RigidTransform(RollPitchYaw(np.radians(self.base_deg)), 1e-3 * np.array(self.base_mm)).inverse()
 
     def scanner_pose(self, X_BC: RigidTransform, t: float) -> RigidTransform:
-        """The scanner's true pose in the robot's base at ``t`` s, ``X_BC`` where nothing has happened."""
+        """Return the scanner's true pose in the robot's base at ``t`` s, ``X_BC`` where nothing has happened."""
         p: Array = X_BC.translation()
         R = X_BC.rotation()
         if t >= self.knock_s:
@@ -89,7 +89,7 @@ class Disturbance:
         return self.world_in_base(t) @ RigidTransform(R, p)
 
     def device(self, scanner: ScannerPreset, t: float) -> ScannerPreset:
-        """The scanner with its own errors at ``t`` s of its warm-up."""
+        """Return the scanner with its own errors at ``t`` s of its warm-up."""
         if not self.warm_up_s:
             return scanner
         cold = float(np.exp(-max(t, 0.0) / self.warm_up_s))
@@ -101,7 +101,7 @@ class Disturbance:
         return replace(scanner, noise=noise)
 
     def summary(self, start_s: float) -> dict[str, Any]:
-        """The truth file's entry, with times on the robot's clock."""
+        """Return the truth file's entry, with times on the robot's clock."""
         out: dict[str, Any] = {}
         if any((*self.knock_mm, *self.knock_deg)):
             out["knock"] = {"time_s": start_s + self.knock_s, "mm": self.knock_mm, "deg": self.knock_deg}
@@ -166,10 +166,10 @@ _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers
 class MotionOptions:
     """What is simulated. Lengths m, times s; ``size`` (width, height) resizes the scanner's image.
 
-    ``stream_columns`` is "joints" or "pose"; ``stream_jitter_s`` the standard deviation of a row's time about its
-    instant; ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside
-    it); ``device_clock`` False leaves out the device's stamps; ``mount_mm`` and ``mount_deg`` are how far the scanner's
-    true pose is off the nominal one; ``stop_and_go`` lets the arm rest for that time at each corner; ``surroundings``
+    ``stream_columns`` is "joints" or "pose". ``stream_jitter_s`` the standard deviation of a row's time about its
+    instant. ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside
+    it). ``device_clock`` False leaves out the device's stamps. ``mount_mm`` and ``mount_deg`` are how far the scanner's
+    true pose is off the nominal one. ``stop_and_go`` lets the arm rest for that time at each corner. ``surroundings``
     False leaves out the table and the blocks on it, which makes the files three times smaller.
     """
 
@@ -259,7 +259,7 @@ class MotionWorld:
         return self.path.joints(t)
 
     def X_BC_at(self, t: float) -> RigidTransform:
-        """The scanner's true pose in the robot's base at ``t`` s after the start."""
+        """Return the scanner's true pose in the robot's base at ``t`` s after the start."""
         return self.options.disturbance.scanner_pose(self.X_BC, t)
 
     def frames(self) -> Iterator[StreamedFrame]:
@@ -287,7 +287,7 @@ class MotionWorld:
             )
 
     def stream(self) -> RobotStream:
-        """The arm's state at its regular instants, rounded, with the jitter of its stamps."""
+        """Return the arm's state at its regular instants, rounded, with the jitter of its stamps."""
         o = self.options
         begin, end = float(self.captures[0]) - o.lead_s, float(self.arrivals[-1]) + o.lead_s
         times = np.arange(begin, end, 1.0 / o.stream_hz)
@@ -369,7 +369,7 @@ def _scanner(o: MotionOptions) -> ScannerPreset:
 
 
 def layout(robot: str, scanner: ScannerPreset) -> tuple[Array, RigidTransform]:
-    """The cube's centre (3,) m in the base and the scanner's nominal pose X_BC, at its optimum distance from it.
+    """Return the cube's centre (3,) m in the base and the scanner's nominal pose X_BC, at its optimum distance from it.
 
     The scanner looks down at the cube from the side that is away from the arm (Fig. 4 of the paper), so that the
     forearm does not stand in its view.
@@ -384,7 +384,7 @@ def layout(robot: str, scanner: ScannerPreset) -> tuple[Array, RigidTransform]:
 
 
 def facing(centre: Array, X_BC: RigidTransform) -> RotationMatrix:
-    """A flange rotation R_BF whose outward normal points from ``centre`` to the scanner."""
+    """Return a flange rotation R_BF whose outward normal points from ``centre`` to the scanner."""
     z = X_BC.translation() - centre
     z = z / np.linalg.norm(z)
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -393,7 +393,7 @@ def facing(centre: Array, X_BC: RigidTransform) -> RotationMatrix:
 
 
 def surroundings(centre: Array) -> list[RigidBody]:
-    """The table and blocks on it in the scanner's view: by them a moved scanner is told from a moved robot."""
+    """Return the table and blocks in the scanner's view: they separate a moved scanner from a moved robot."""
     blocks = []
     for x, y, top in ((-0.16, 0.22, 0.24), (0.10, 0.24, 0.18), (0.16, -0.25, 0.22), (-0.10, -0.26, 0.14)):
         place = centre + np.array([x, y, 0.0])
@@ -404,7 +404,7 @@ def surroundings(centre: Array) -> list[RigidBody]:
 
 
 def _mounted(X: RigidTransform, translation_m: float, rotation_rad: float, rng: np.random.Generator) -> RigidTransform:
-    """A pose off the nominal one by up to a length and an angle in random directions."""
+    """Return a pose off the nominal one by up to a length and an angle in random directions."""
     off = rng.uniform(-1.0, 1.0, 6)
     turn = RollPitchYaw(*(rotation_rad * off[:3])).ToRotationMatrix()
     return RigidTransform(X.rotation() @ turn, X.translation() + translation_m * off[3:])
@@ -442,7 +442,7 @@ class StaticMode:
         return Look(points, X_BF, fit_flange(points, w.flange, guess=guess))
 
     def grid(self, seed: int, progress: Progress) -> list[Look]:
-        """The scans of the grid, without those that do not show the flange."""
+        """Return the scans of the grid, without those that do not show the flange."""
         w, rng = self._world, np.random.default_rng([seed, 4])
         found, q = [], w.path.waypoints[0]
         steps = SIDE_M * (np.arange(GRID) / (GRID - 1) - 0.5)

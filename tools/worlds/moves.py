@@ -285,7 +285,7 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> FeatureWorld:
 
 
 def _best_move(p_C: Array, p_B: Array, R: Array, p: Array, which: Array) -> Array:
-    """The turn and shift (6,) about the middle of the work that the systematic errors there look like."""
+    """Return the turn and shift (6,) about the middle of the work that the systematic errors there look like."""
     seen = np.einsum("nij,nj->ni", R[which], p_C[which]) + p[which]
     X = fit_rigid(p_B[which] - _CENTER, seen - _CENTER)
     return np.concatenate([rotation_vector(X.rotation()), X.translation()])

@@ -58,7 +58,7 @@ class Trapezoid:
         return 1.0 / (self.a * self.ramp_s) + self.ramp_s
 
     def s(self, t: float) -> float:
-        """The parameter at ``t`` s after the start."""
+        """Return the parameter at ``t`` s after the start."""
         ramp, whole = self.ramp_s, self.duration_s
         if t <= 0.0:
             return 0.0
@@ -150,7 +150,7 @@ def path_through(
     acceleration: float = 1.2,
     dwell_s: float = 0.0,
 ) -> RobotPath:
-    """A closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
+    """Return a closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
 
     Raises InputError out of reach.
     """
@@ -209,7 +209,7 @@ _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base.
+    """Hold a rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None is fixed in the base.
 
     ``dark`` 0 to 1.
     """
@@ -241,7 +241,7 @@ class _Cast:
 
 
 def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
-    """The drawn solids of an arm and the mesh of its flange, in their links' frames."""
+    """Return the drawn solids of an arm and the mesh of its flange, in their links' frames."""
     root = ET.fromstring(arm_urdf(arm))
     bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
@@ -280,10 +280,10 @@ class MovingScene:
         scanner: ScannerPreset | None = None,
         X_BW: RigidTransform | None = None,
     ) -> Depth:
-        """The depth map (H, W) m of one frame, 0 where nothing was measured.
+        """Return the depth map (H, W) m of one frame, 0 where nothing was measured.
 
         ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle
-        row; ``samples`` times of the exposure are mixed; ``scanner`` has the errors of this frame (the preset's);
+        row. ``samples`` times of the exposure are mixed. ``scanner`` has the errors of this frame (the preset's).
         ``X_BW`` is the pose in the base of what stands still (identity).
         """
         device = self.scanner if scanner is None else scanner
@@ -365,7 +365,7 @@ class MovingScene:
         return out
 
     def _static(self, X_WC: RigidTransform) -> Depth:
-        """Depth (H, W) of what stands still, rendered again where the camera has moved."""
+        """Return the depth (H, W) of the static surroundings, rendered again where the camera has moved."""
         pose = X_WC.GetAsMatrix34()
         if self._background is not None and np.array_equal(self._background[0], pose):
             return self._background[1]

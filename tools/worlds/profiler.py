@@ -52,7 +52,7 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerCell:
-    """Where a world's arm stands.
+    """Hold the pose of a world's arm.
 
     Its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where the groove's and the
     frustum's frames lie, the groove turned about z.
@@ -85,7 +85,7 @@ def files_cell() -> ProfilerCell:
 
 
 def ur10e_cell() -> ProfilerCell:
-    """A UR10e."""
+    """Return a UR10e."""
     center = np.array([-0.75, 0.12, 0.18])
     return ProfilerCell(
         arm=DhArm.of(load_arm("ur10e")),
@@ -151,7 +151,7 @@ class SphereWorld:
 
     @staticmethod
     def made(seed: int, errors: WorldErrors | None = None) -> SphereWorld:
-        """A UR10e's world of a seed, the scanner somewhere else in each."""
+        """Return a UR10e's world of a seed, the scanner somewhere else in each."""
         e = errors or WorldErrors()
         rng = np.random.default_rng([seed, 71])
         cell = ur10e_cell()
@@ -232,7 +232,7 @@ class SphereWorld:
 
 
 def _wrong(arm: DhArm, e: WorldErrors, rng: np.random.Generator) -> DhArm:
-    """The arm as it was built."""
+    """Return the arm as it was built."""
     return DhArm(arm.rows + rng.standard_normal((6, 4)) * [e.length_m, e.twist_rad, e.length_m, e.angle_rad])
 
 
@@ -363,7 +363,7 @@ def groove_mesh() -> TriMesh:
 
 
 def boss_mesh() -> TriMesh:
-    """A square frustum on a plate, its base at z = 0; slanted edges of 50 mm, sides inclined by atan(4/3)."""
+    """Return a square frustum on a plate, its base at z = 0; slanted edges of 50 mm, sides inclined by atan(4/3)."""
     k = HIP_M / np.sqrt(34.0)
     half, base, height = 0.5 * TOP_M, 0.5 * TOP_M + 3 * k, 4 * k
     ring = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -385,7 +385,7 @@ def _perfect(width_m: float, samples: int) -> ProfilerPreset:
 def _seen(
     world: SphereWorld, mesh: TriMesh, turn: Floats, place: Floats, X: FlangePoses, preset: ProfilerPreset
 ) -> Floats:
-    """Profiles (n, m, 2) without noise, of a mesh that stands at X_BP = (turn, place)."""
+    """Return profiles (n, m, 2) without noise, of a mesh at X_BP = (turn, place)."""
     R = np.einsum("ji,njk->nik", turn, X.rotation @ world.rotation)
     o = (X.rotation @ world.translation + X.translation - place) @ turn
     return cast_profiles(make_scene(mesh), R, o, preset)

@@ -81,7 +81,7 @@ def home_of(arm: str) -> Array:
 
 
 def arm_scenario(arm: str, seam_mm: float) -> str:
-    """The scenario's YAML text for that arm, with a weld of ``seam_mm``."""
+    """Return the scenario's YAML text for that arm, with a weld of ``seam_mm``."""
     scale = scale_of(arm)
     return TEXT.format(
         title=get_robot(arm).title,

@@ -19,7 +19,7 @@ _XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
 def _scan(rng: Rng) -> Array:
-    """A sloping face on a grid (H, W, 3) m, zeros beside a disc of 60 to 70 pixels."""
+    """Return a sloping face on a grid (H, W, 3) m, zeros beside a disc of 60 to 70 pixels."""
     v, u = np.mgrid[:_H, :_W]
     z = 0.6 + rng.uniform(-0.002, 0.002) * u + rng.uniform(-0.002, 0.002) * v
     scan = np.stack([(u - 5.5) * z / 300.0, (v - 4.5) * z / 300.0, z], axis=-1)
@@ -32,7 +32,7 @@ def _order(rng: Rng) -> tuple[str, str]:
 
 
 def ply_grid(rng: Rng) -> Files:
-    """A whole scan with num_cols and num_rows, or its measured points and a range_grid."""
+    """Return a whole scan with num_cols and num_rows, or its measured points and a range_grid."""
     scan = _scan(rng).reshape(-1, 3)
     seen = scan.any(axis=1)
     letter, name = _order(rng)
@@ -70,12 +70,12 @@ def ply_lists(rng: Rng) -> Files:
 
 
 def ply_gz(rng: Rng) -> Files:
-    """A packed whole scan."""
+    """Return a packed whole scan."""
     return {"a.ply.gz": gzip.compress(ply_grid(rng)["a.ply"], mtime=0)}
 
 
 def pcd_stored(rng: Rng) -> Files:
-    """A compressed PCD whose body is stored as it is, field by field."""
+    """Return a compressed PCD whose body is stored as it is, field by field."""
     body = points(rng).astype("<f4").T.tobytes()
     head = (
         "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
@@ -85,7 +85,7 @@ def pcd_stored(rng: Rng) -> Files:
 
 
 def pts(rng: Rng) -> Files:
-    """The number of points, then x y z, intensity and colour of each."""
+    """Return the number of points, then x y z, intensity and colour of each."""
     rows = "".join(f"{x:.6f} {y:.6f} {z:.6f} 55 52 44 65\n" for x, y, z in points(rng))
     return {"a.pts": f"60\n{rows}".encode()}
 
@@ -98,20 +98,20 @@ def _depth_set(rng: Rng, name: str, content: bytes) -> Files:
 
 
 def depth_png(rng: Rng) -> Files:
-    """A depth image of 16 bits in mm, and its camera."""
+    """Return a depth image of 16 bits in mm, and its camera."""
     depth = np.round(1e3 * _scan(rng)[..., 2]).astype(np.uint16)
     return _depth_set(rng, ".png", bytes(cv2.imencode(".png", depth)[1]))
 
 
 def depth_tiff(rng: Rng) -> Files:
-    """A depth image of floating-point metres or 16 bits in mm, and its camera."""
+    """Return a depth image of floating-point metres or 16 bits in mm, and its camera."""
     depth = _scan(rng)[..., 2]
     pixels = depth.astype(np.float32) if rng.random() < 0.5 else np.round(1e3 * depth).astype(np.uint16)
     return _depth_set(rng, ".tif", bytes(cv2.imencode(".tif", pixels)[1]))
 
 
 def depth_npy(rng: Rng) -> Files:
-    """A depth image as an array of mm or metres, and its camera."""
+    """Return a depth image as an array of mm or metres, and its camera."""
     depth = _scan(rng)[..., 2]
     stream = io.BytesIO()
     np.save(stream, np.round(1e3 * depth).astype(np.uint16) if rng.random() < 0.5 else depth.astype(np.float32))
@@ -177,7 +177,7 @@ def _camera(G: Array) -> bytes:
 
 
 def program(rng: Rng) -> Files:
-    """A robot program beside a table of the camera's poses."""
+    """Return a robot program beside a table of the camera's poses."""
     F, G = hand_eye_lists(rng)
     before, after, line = _PROGRAMS[int(rng.integers(len(_PROGRAMS)))]
     rows = [line(k, X[:3, 3], Rotation.from_matrix(X[:3, :3])) for k, X in enumerate(F)]
@@ -194,7 +194,7 @@ def captions(rng: Rng) -> Files:
 
 
 def documents(rng: Rng) -> Files:
-    """A YAML document for each pose, as ROS prints messages."""
+    """Return a YAML document for each pose, as ROS prints messages."""
     F, G = hand_eye_lists(rng)
     found = []
     for X in F:
@@ -242,7 +242,7 @@ def matlab(rng: Rng) -> Files:
 
 
 def folder(rng: Rng) -> Files:
-    """A JSON file for each sample."""
+    """Return a JSON file for each sample."""
     F, G = hand_eye_lists(rng)
     return {
         f"set/sample_{k}.json": json.dumps({"robot": a.tolist(), "camera": b.tolist()}, indent=1).encode()

@@ -76,12 +76,12 @@ TOUCHING_MM = {9: (1.23, 1.29, 1.26, 1.21, 1.26), 12: (0.98, 1.02, 0.99, 1.03, 1
 
 
 def printed_stage(model: Model, stage: int) -> PrintedStage:
-    """The results table of one stage of one chain."""
+    """Return the results table of one stage of one chain."""
     return (STAGE_1 if stage == 1 else STAGE_2)[model]
 
 
 def published_touches() -> TabletTouches:
-    """The paper's nine touches, SI units."""
+    """Return the paper's nine touches, SI units."""
     return TabletTouches(
         uv_px=TABLE_2[:, 0:2],
         depth_m=1e-3 * TABLE_2[:, 2],

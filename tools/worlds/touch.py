@@ -91,7 +91,7 @@ def _wrong(arm: ArmModel, rng: np.random.Generator) -> ArmModel:
 
 
 def _upright(rng: np.random.Generator, tilt_rad: float) -> RotationMatrix:
-    """A flange that points down, tilted by up to ``tilt_rad`` and turned by up to 60 degrees."""
+    """Return a flange that points down, tilted by up to ``tilt_rad`` and turned by up to 60 degrees."""
     around, tilt = rng.uniform(0.0, 2.0 * np.pi), tilt_rad * np.sqrt(rng.uniform())
     lean = exp_rotation(tilt * np.array([np.cos(around), np.sin(around), 0.0]))
     return (
@@ -188,7 +188,7 @@ def _touch(
 
 
 def _seen_direction(scanner: _Scanner, p: Array, n: Array, sigma: float, rng: np.random.Generator) -> Array:
-    """The normal that the scanner gives a small plate at p with normal n."""
+    """Return the normal that the scanner gives a small plate at p with normal n."""
     a = np.cross(n, [0.0, 1.0, 0.0])
     a /= np.linalg.norm(a)
     ends = [scanner.sees(p + 0.01 * d) - scanner.sees(p - 0.01 * d) for d in (a, np.cross(n, a))]

@@ -50,7 +50,7 @@ WORK_C = np.array([0.02, -0.05, 0.38])
 
 @cache
 def _splines(device: int, warp_m: float) -> Array:
-    """Coefficients of the cubic splines through the device's depth errors, with room for the border's continuation."""
+    """Return coefficients of the cubic splines through the device's depth errors, padded for the border."""
     image = np.pad(np.asarray(device_warp((401, 401), warp_m, device), dtype=float), _BORDER, mode="edge")
     return np.asarray(spline_filter(image, 3, mode="nearest"))
 
@@ -97,7 +97,7 @@ def warped_observations(
 
 
 def _circle(X_CR: RigidTransform, center_C: Array, ratio: float) -> HolePattern:
-    """The hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
+    """Return the hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
     return HolePattern(holes_C=np.zeros((4, 3)), center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0)
 
 
@@ -169,7 +169,7 @@ WRONG = ScannerCorrection(1.002, (0.006, -0.004))
 def measured_by_a_wrong_scanner(
     observations: list[Observation], rng: np.random.Generator
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
+    """Return the same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
     out, patterns = [], {}
     for o in observations:
         seen = as_measured(np.asarray(o.p_CR))
@@ -222,7 +222,7 @@ def station(
 ) -> WrongArmStation:
     """Draw a UR10e with wrong joints and axes, and a distorting scanner 0.65 m from its flange.
 
-    Joint offsets of 0.02 to 0.05 degrees, axes off by 0.1 to 0.3 mm and 0.02 degrees; the scanner has a scale error of
+    Joint offsets of 0.02 to 0.05 degrees, axes off by 0.1 to 0.3 mm and 0.02 degrees. The scanner has a scale error of
     0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the correction's polynomial has only in part.
 
     ``planned``: the scans are those of 250 candidates that tell most (informative_poses); the new ones are random.

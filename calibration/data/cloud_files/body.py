@@ -191,7 +191,7 @@ def _is_number(word: bytes) -> bool:
 
 
 def measured(points: Array, name: str) -> Array:
-    """The points without missing ones: NaN in a grid, left out of a list.
+    """Return the points without missing ones: NaN in a grid, left out of a list.
 
     A list in the sensor's order becomes its grid.
 

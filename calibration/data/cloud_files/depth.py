@@ -48,12 +48,12 @@ class DepthIntrinsics:
 
 
 def is_camera_file(path: Path) -> bool:
-    """Whether a file's name says that it holds a camera's intrinsics."""
+    """Return whether a file's name says that it holds a camera's intrinsics."""
     return path.stem.lower() in _STEMS and path.suffix.lower() in (*_TREES, *_TEXTS)
 
 
 def find_intrinsics(*folders: Path) -> DepthIntrinsics | None:
-    """The camera of the first of these folders that holds a file of one; None where none does.
+    """Return the camera of the first of these folders that holds a file of one; None where none does.
 
     Raises:
         CloudError: a file of that name cannot be read, or holds no intrinsics.
@@ -91,8 +91,9 @@ def intrinsics_of(
     height, width = shape
     if found is None:
         raise CloudError(
-            f"{name} is a depth image of {width} x {height} pixels, and its camera's intrinsics are not known:"
-            f" {_ADVICE}, or put the camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the images."
+            f"{name} is a depth image of {width} x {height} pixels, but the intrinsics of its camera are missing. To"
+            f" give them, {_ADVICE}, or put the camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the"
+            " images."
         )
     if found.size not in ((0, 0), (width, height)):
         raise CloudError(
@@ -108,7 +109,7 @@ def intrinsics_of(
 
 
 def _stated(path: Path) -> DepthIntrinsics | None:
-    """The camera in a file; None where it holds none."""
+    """Return the camera in a file; None where it holds none."""
     try:
         found = find_camera(path)
     except InputError as problem:
@@ -121,13 +122,13 @@ def _stated(path: Path) -> DepthIntrinsics | None:
 
 
 def may_be_depth(path: Path) -> bool:
-    """Whether an image can be a depth image: a PNG of one channel with 16 bits, or a TIFF."""
+    """Return whether an image can be a depth image: a PNG of one channel with 16 bits, or a TIFF."""
     ending = path.suffix.lower()
     return ending in IMAGES and (ending != ".png" or png_depth(path) == (_PIXEL_BITS, 1))
 
 
 def is_depth(path: Path) -> bool:
-    """Whether a cloud's file is a depth image, whose points need the camera's intrinsics."""
+    """Return whether a cloud's file is a depth image, whose points need the camera's intrinsics."""
     if path.suffix.lower() != ".npy":
         return path.suffix.lower() in IMAGES
     try:
@@ -137,7 +138,7 @@ def is_depth(path: Path) -> bool:
 
 
 def camera_of(path: Path, form: CloudForm) -> DepthIntrinsics | None:
-    """The camera of a depth image: as stated, else of a file beside it or in the dataset's folder.
+    """Return the camera of a depth image: as stated, else of a file beside it or in the dataset's folder.
 
     Raises CloudError.
     """
@@ -178,7 +179,7 @@ def depth_points(path: Path, pixels: Any, form: CloudForm) -> Array:
 
 
 def is_depth_array(array: Any) -> bool:
-    """Whether an array of an NPY file is a depth image: two sides, neither of which is the three coordinates."""
+    """Return whether an array of an NPY file is a depth image: two sides, neither of which is the three coordinates."""
     return _flat(array.shape)
 
 

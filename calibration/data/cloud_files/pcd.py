@@ -55,7 +55,7 @@ def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
 
     VIEWPOINT is the pose of the sensor when it took the scan. PCL's documentation does not state the frame of the
     points, and programs differ: PCL's viewer and `transform_from_viewpoint` apply VIEWPOINT to points in the sensor's
-    frame; PCL's estimation of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT
+    frame. PCL's estimation of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT
     other than identity is refused until ``form.viewpoint`` says which: ``sensor`` (it is not applied) or ``world`` (it
     is undone).
 
@@ -93,8 +93,8 @@ def _in_sensor_frame(path: Path, points: Array, viewpoint: tuple[float, ...], fo
     if form.viewpoint != "world":
         raise CloudError(
             f"{path.name} has the VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}, and programs differ in what that"
-            " means: write 'viewpoint: sensor' into dataset.yaml where the points are in the sensor's frame,"
-            " 'viewpoint: world' where they were moved by VIEWPOINT."
+            " means. If the points are in the sensor's frame, write 'viewpoint: sensor' into dataset.yaml. If VIEWPOINT"
+            " has already been applied to the points, write 'viewpoint: world'."
         )
     missing = ~points.any(axis=1)
     wxyz = np.array(viewpoint[3:])
@@ -159,7 +159,7 @@ def _header(path: Path, begin: bytes) -> _Header:
 
 
 def _viewpoint(path: Path, words: list[str]) -> tuple[float, ...]:
-    """The seven numbers of VIEWPOINT; empty where it is the identity or not stated."""
+    """Return the seven numbers of VIEWPOINT; empty where it is the identity or not stated."""
     if not words:
         return ()
     try:

@@ -107,7 +107,7 @@ def walked(path: Path, order: str, e: Element, content: bytes) -> tuple[NDArray[
 
 
 def cells(path: Path, order: str, e: Element, content: bytes) -> tuple[NDArray[np.int64], int]:
-    """The index of the point of each cell of a range_grid, -1 for an empty cell, and the bytes of all cells."""
+    """Return the index of the point of each cell of a range_grid, -1 for an empty cell, and the bytes of all cells."""
     damaged = CloudError(f"The file {path.name} is damaged: a cell of its range_grid holds more than one point.")
     if len(e.properties) != 1 or e.properties[0][1][0] == "f":
         raise damaged
@@ -136,7 +136,7 @@ def cells(path: Path, order: str, e: Element, content: bytes) -> tuple[NDArray[n
 
 
 def text_cells(path: Path, e: Element, words: list[bytes], columns: list[int]) -> list[bytes]:
-    """The words of some properties of a record in text."""
+    """Return the words of some properties of a record in text."""
     places, at = [], 0
     for _, _, counter in e.properties:
         places.append(at)
@@ -276,7 +276,7 @@ def _check_elements(path: Path, elements: list[Element]) -> None:
 def _text(
     path: Path, h: _Header, columns: list[int], stream: BinaryIO, there: int
 ) -> tuple[Array, NDArray[np.int64] | None]:
-    """The points of a text body, and the point of each cell of its range_grid."""
+    """Return the points of a text body, and the point of each cell of its range_grid."""
     before, vertex = sum(e.count for e in h.elements[: h.at]), h.elements[h.at]
     lines = sum(e.count for e in h.elements)
     if vertex.size is not None:
@@ -364,7 +364,7 @@ def _vertices(path: Path, order: str, e: Element, columns: list[int], content: b
 
 
 def _placed(path: Path, points: Array, of_cells: NDArray[np.int64], sides: tuple[int, int]) -> Array:
-    """The points (H, W, 3) in the cells of a range_grid, NaN in empty ones.
+    """Return the points (H, W, 3) in the cells of a range_grid, NaN in empty ones.
 
     (N, 3) where no grid of two sides is stated.
     """

@@ -52,7 +52,7 @@ class _Poses:
 
 
 def find_bag(folder: Path) -> Path | None:
-    """The recording of a folder.
+    """Return the recording of a folder.
 
     The folder itself where it has ROS 2's metadata.yaml, else its one .mcap, .db3 or .bag file.
     """
@@ -137,7 +137,7 @@ def _time(header: Any, arrival_ns: int) -> float:
 
 
 def _points(path: Path, m: Any) -> Array:
-    """The points of a PointCloud2, (N, 3) or (H, W, 3), NaN where a pixel has none."""
+    """Return the points of a PointCloud2, (N, 3) or (H, W, 3), NaN where a pixel has none."""
     fields = {f.name: f for f in m.fields}
     if not {"x", "y", "z"} <= set(fields) or m.is_bigendian or m.height * m.width > MOST_POINTS:
         raise DatasetError(f"A cloud of '{path.name}' has no fields x, y, z that can be read.")
@@ -242,7 +242,7 @@ def _table(rows: list[tuple[float, Array]]) -> tuple[Array, Array]:
 
 
 def _chained(path: Path, s: _Poses, form: PoseForm, *, needed: bool) -> tuple[Array, Array, str] | None:
-    """The flange in the base along the tree of transforms."""
+    """Return the flange in the base along the tree of transforms."""
     parent = {child: above for above, child in s.transforms}
     frames = {*parent, *parent.values()}
     flange = form.flange_frame or next((f for f in FLANGES if f in parent), "")
@@ -291,7 +291,7 @@ def _at(times: Array, X: Array, when: Array) -> Array:
 
 
 def _at_rest(path: Path, clouds: list[tuple[float, Array]], times: Array, X: Array, said: str) -> BagScans:
-    """The scans at which the arm rested, one for each pose."""
+    """Return the scans at which the arm rested, one for each pose."""
     kept: list[tuple[str, Array, Array, float]] = []
     refused: list[tuple[str, str]] = []
     digits = len(str(len(clouds)))

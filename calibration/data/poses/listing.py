@@ -68,7 +68,7 @@ class Listing:
         return out
 
     def stated(self, form: PoseForm, option: str) -> "Listing":
-        """The list with what dataset.yaml or an option states of its form.
+        """Return the list with what dataset.yaml or an option states of its form.
 
         Raises DatasetError where the numbers contradict it.
         """
@@ -120,7 +120,7 @@ def listing_of(
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
-    """A list of an array of a usual shape.
+    """Return a list of an array of a usual shape.
 
     (4, 4), (3, 4), (n, 4, 4), (n, 3, 4), (4, 4, n), (4 n, 4), (n, 16), (n, 12), (n, 6), (n, 7), each also with a column
     of times before it, and (6, n), (7, n).
@@ -157,7 +157,7 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
 
 
 def looks_like_poses(values: Array) -> bool:
-    """Whether an array has a shape and numbers that only poses have."""
+    """Return whether an array has a shape and numbers that only poses have."""
     v = np.asarray(values, dtype=float)
     kinds = [kind for kind, *_ in _meanings(v)] if v.size else []
     return bool(kinds) and (
@@ -239,7 +239,7 @@ def _unit(q: Array) -> bool:
 
 
 def require_pose(lists: list[Listing]) -> list[Listing]:
-    """The lists.
+    """Return the lists.
 
     Raises DatasetError where one pose alone is missing: it may be one of many files, and is left out there.
     """

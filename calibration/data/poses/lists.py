@@ -40,7 +40,7 @@ _INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target
 
 
 def read_lists(path: Path) -> list[Listing]:
-    """Every list of poses of one file.
+    """Return every list of poses of one file.
 
     Raises:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
@@ -49,7 +49,7 @@ def read_lists(path: Path) -> list[Listing]:
 
 
 def lists_of_file(path: Path) -> list[Listing]:
-    """Every list of poses of one of many files: a single pose may be missing there, and is left out.
+    """Return every list of poses of one of many files: a single pose may be missing there, and is left out.
 
     Raises:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
@@ -82,7 +82,7 @@ def lists_of_file(path: Path) -> list[Listing]:
 
 
 def folder_lists(folder: Path, needed: int = 2, skip: frozenset[Path] = frozenset()) -> list[Listing]:
-    """Every list of poses of a folder.
+    """Return every list of poses of a folder.
 
     Of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one level deep.
 
@@ -133,7 +133,7 @@ def _numbered_folders(folder: Path) -> frozenset[Path]:
 
 
 def _may_hold_poses(path: Path) -> bool:
-    """Whether a file's name is that of poses.
+    """Return whether a file's name is that of poses.
 
     Raises DatasetError where another thing than a file or a folder has such a name.
     """
@@ -144,14 +144,14 @@ def _may_hold_poses(path: Path) -> bool:
 
 
 def _one_of_files(folder: Path) -> bool:
-    """Whether a folder has the name of one of several numbered files beside it."""
+    """Return whether a folder has the name of one of several numbered files beside it."""
     stem = re.sub(r"\d+$", "", folder.stem)
     alike = (p for p in folder.parent.glob(f"*{folder.suffix}") if re.sub(r"\d+$", "", p.stem) == stem and p.is_file())
     return stem != folder.stem and next(alike, None) is not None
 
 
 def _group(files: list[Path], label: str) -> list[Listing]:
-    """The lists of one file, or one list of many files with a pose each."""
+    """Return the lists of one file, or one list of many files with a pose each."""
     prefix = f"{label}/" if label else ""
     if len(files) == 1:
         return [_renamed(one, prefix) for one in read_lists(files[0])]
@@ -191,7 +191,7 @@ def _renamed(listing: Listing, prefix: str) -> Listing:
 def two_lists(
     lists: list[Listing], source: str, robot: str | None = None, camera: str | None = None
 ) -> tuple[Listing, Listing]:
-    """The robot's and the camera's list among those of a source.
+    """Return the robot's and the camera's list among those of a source.
 
     Args:
         robot, camera: part of the name of the list that holds them, as the user states it.
@@ -233,13 +233,13 @@ def two_lists(
             " into one folder as robot.csv and camera.csv, or name them."
         )
     raise DatasetError(
-        f"The names of the lists of '{source}' do not tell {missing} poses: {known}. Name them with --robot-poses and"
-        " --camera-poses."
+        f"The names of the lists in '{source}' do not show which one has {missing} poses: {known}. Name them with"
+        " --robot-poses and --camera-poses."
     )
 
 
 def named_inverse(listing: Listing) -> bool:
-    """Whether a list's name says that it holds the inverse poses, such as R_base2gripper."""
+    """Return whether a list's name says that it holds the inverse poses, such as R_base2gripper."""
     return _INVERSE.search(last_key(listing.name)) is not None
 
 
@@ -285,7 +285,7 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
 
 
 def _unzipped(path: Path) -> str:
-    """The text of a robot program that is stored compressed."""
+    """Return the text of a robot program that is stored compressed."""
     try:
         with gzip.open(path) as stream:
             found = stream.read(LARGEST_DOCUMENT + 1)
@@ -305,7 +305,7 @@ def _numbers(path: Path, value: Any) -> Any:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
+    """Return whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
     with path.open("rb") as stream:
         return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
 

@@ -108,7 +108,7 @@ def natural(name: str) -> tuple[tuple[bool, int, str], ...]:
 
 
 def number_of(name: str) -> int | None:
-    """The last whole number in a name: 7 of "img_0007"; None where there is none."""
+    """Return the last whole number in a name: 7 of "img_0007"; None where there is none."""
     found: list[str] = re.findall(r"\d+", name)
     return int(found[-1]) if found else None
 
@@ -137,7 +137,7 @@ _POSES = re.compile(r"(?i)(^|[^a-z])pos(es?)?([^a-z]|$)")
 
 
 def last_key(name: str) -> str:
-    """The last word of a list's name: its key in the file."""
+    """Return the last word of a list's name: its key in the file."""
     return re.split(r"[/,\s]+", name)[-1]
 
 
@@ -186,7 +186,7 @@ class PoseColumn:
 
 
 def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
-    """The columns of poses of a header, and the places of its ids and times.
+    """Return the columns of poses of a header, and the places of its ids and times.
 
     Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
     for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to

@@ -184,7 +184,7 @@ def _kawasaki(text: str, name: str) -> Listing | None:
 
 
 def list_of_program(text: str, name: str) -> Listing | None:
-    """The poses of a robot program, a pose file or a log of transforms; None where the text is none of them.
+    """Return the poses of a robot program, a pose file or a log of transforms; None where the text is none of them.
 
     Raises:
         DatasetError: it holds joint angles and no poses.

@@ -88,7 +88,7 @@ class PoseReading:
     X: Array
 
     def changed(self, change: str) -> "PoseReading":
-        """The reading with one of CHANGES applied."""
+        """Return the reading with one of CHANGES applied."""
         words = {
             "transposed": "rotations transposed",
             "left_handed": "in a left-handed frame (y mirrored)",
@@ -98,7 +98,7 @@ class PoseReading:
 
 
 def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[PoseReading]:
-    """The readings of some rows."""
+    """Return the readings of some rows."""
     return [replace(one, X=one.X[rows]) for one in listed]
 
 
@@ -247,7 +247,7 @@ _ANGLES = _angle_readings()
 
 
 def notation(word: str, where: str) -> str:
-    """A notation by its name; empty stays empty. Raises DatasetError naming those known."""
+    """Return a notation by its name; empty stays empty. Raises DatasetError naming those known."""
     name = _ALIASES.get(word.strip().lower(), word.strip())
     if name in ("", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"):
         return name

@@ -90,8 +90,8 @@ def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
         if closed:
             ending = Path(closed[0]).suffix.lower()
             raise DatasetError(
-                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), a closed format that only software of"
-                f" {_CLOSED[ending]} reads: export each as .ply or .pcd, or its points as .npy, beside the poses."
+                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), which only software of"
+                f" {_CLOSED[ending]} can read. Export each as .ply or .pcd, or its points as .npy, beside the poses."
             )
     raise DatasetError(
         f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz,"
@@ -142,9 +142,9 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
         raise _apart(ids, clouds, source)
     if len(clouds) != n:
         raise DatasetError(
-            f"'{source}' holds {n} poses, and there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name});"
-            " without names each pose needs its cloud, in the same order: remove what has no partner, or add a column"
-            " id with the clouds' names."
+            f"'{source}' has {n} poses, but there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name})."
+            " Without names, each pose needs one cloud, in the same order. Remove what has no partner, or add a column"
+            " 'id' with the clouds' names."
         )
     return [cloud_id(p) for p in clouds], list(clouds), f"paired in order, {clouds[0].name} with the first pose"
 
@@ -167,7 +167,7 @@ def _apart(ids: Sequence[str], clouds: Sequence[Path], source: str) -> DatasetEr
 
 
 def find_poses(folder: Path) -> Path | tuple[Path, ...] | None:
-    """The poses of a folder: a file, one file per pose in the natural order of their names, or None.
+    """Return the poses of a folder: a file, one file per pose in the natural order of their names, or None.
 
     Known are poses.* and the like, a folder poses/, and files such as pos01.yaml beside the clouds.
     """
@@ -205,7 +205,7 @@ def is_plain(path: Path) -> bool:
 
 
 def files_of_poses(folder: Path) -> tuple[Path, ...]:
-    """The files of a folder that may hold poses, in the natural order of their names."""
+    """Return the files of a folder that may hold poses, in the natural order of their names."""
     return tuple(_files(folder))
 
 
@@ -250,7 +250,7 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
 
 
 def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
-    """The list of the flange's poses among those of a file.
+    """Return the list of the flange's poses among those of a file.
 
     The only one, the one of the flange's frame, or the one that names the robot.
     """

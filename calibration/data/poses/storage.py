@@ -41,7 +41,7 @@ def read_tree(path: Path) -> Any:
 
 
 def tree_of_text(text: str, name: str, kind: str = "YAML") -> Any:
-    """The contents of a text of YAML or JSON; several YAML documents, or a JSON object a line, are a list.
+    """Return the contents of a text of YAML or JSON; several YAML documents, or a JSON object a line, are a list.
 
     Raises InputError.
     """
@@ -67,7 +67,7 @@ def _array(value: Any) -> Array | None:
 
 
 def _matrices(tree: Any) -> Any:
-    """The tree with each FileStorage matrix ({rows, cols, data}) as an array."""
+    """Return the tree with each FileStorage matrix ({rows, cols, data}) as an array."""
     if isinstance(tree, list):
         return [_matrices(v) for v in tree]
     if not isinstance(tree, Mapping):
@@ -113,7 +113,7 @@ def _element(path: Path, element: ElementTree.Element, level: int) -> Any:
 
 
 def matlab_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """The variables of a file: arrays without axes of length 1, cells as lists, structs as mappings.
+    """Return the variables of a file: arrays without axes of length 1, cells as lists, structs as mappings.
 
     Texts and objects are left out.
 
@@ -161,7 +161,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _variable(data: bytes, order: str, level: int) -> tuple[str, Any]:
-    """The name and the value of an array; None for a text or an object."""
+    """Return the name and the value of an array; None for a text or an object."""
     if level > DEEPEST:
         raise ValueError("too many levels")
     parts = _elements(data, order)

@@ -47,7 +47,7 @@ _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def lists_of_text(text: str, name: str) -> list[Listing]:
-    """Every list of poses of a text.
+    """Return every list of poses of a text.
 
     Args:
         text: of a table, a program or a log.
@@ -60,15 +60,15 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
     require_short_numbers(text, name)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
-            f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length."
-            " Write the inverse poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
+            f"'{name}' is COLMAP's images.txt, whose poses are inverted (world in camera) and have no unit of length."
+            " Invert them, scale them to metres by a known length, and write them as a table x,y,z,qw,qx,qy,qz."
         )
     found = list_of_program(text, name)
     return [found] if found is not None else _keyed(text, name) or _numbers(text, name)
 
 
 def _keyed(text: str, name: str) -> list[Listing]:
-    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each.
+    """Return the lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each.
 
     Empty where it has none.
     """
@@ -149,7 +149,7 @@ def _numbers(text: str, name: str) -> list[Listing]:
 
 
 def _two_a_row(rows: list[list[float]]) -> bool:
-    """Whether rows hold two poses each: 14 numbers, or 12 of which those that would be cosines exceed 1."""
+    """Return whether rows hold two poses each: 14 numbers, or 12 of which those that would be cosines exceed 1."""
     n = len(rows[0])
     if len(rows) < 2 or any(len(row) != n for row in rows):
         return False
@@ -181,7 +181,7 @@ def _filled(line: _Line) -> int:
 
 
 def _captioned(lines: Sequence[_Line]) -> dict[str, list[_Line]] | None:
-    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``.
+    """Return the rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``.
 
     None where the captions are not of two lists.
     """
@@ -203,7 +203,7 @@ def _captioned(lines: Sequence[_Line]) -> dict[str, list[_Line]] | None:
 
 
 def _tail(row: _Line) -> list[float]:
-    """The numbers of a row, without words."""
+    """Return the numbers of a row, without words."""
     return [v for v in row.values if v is not None]
 
 
@@ -239,7 +239,7 @@ def _quaternion_rows(table: Array) -> bool:
 
 
 def _lines(text: str) -> tuple[list[_Line], list[_Line]]:
-    """The lines of a table in cells, and its comments."""
+    """Return the lines of a table in cells, and its comments."""
     plain = re.split(r"\r\n|\n|\r", text)
     rows = [(k, s) for k, s in enumerate(plain, 1) if s.strip() and not s.lstrip().startswith(_COMMENT)]
     comments = [
@@ -341,7 +341,7 @@ def _frames(header: list[str], frames: dict[str, list[_Line]], name: str) -> lis
 
 
 def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...] = ()) -> list[Listing]:
-    """The lists of poses of a table (n, columns) of numbers with named columns.
+    """Return the lists of poses of a table (n, columns) of numbers with named columns.
 
     Raises:
         DatasetError: a list has no position or no rotation.

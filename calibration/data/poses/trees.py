@@ -36,7 +36,7 @@ _POSITION = re.compile(r"(?i)^(.*_)?(position|translation|xyz|pos|trans|tvec|t|p
 
 
 def lists_of_tree(tree: Any, name: str) -> list[Listing]:
-    """Every list of poses of a tree of mappings, lists and arrays; the key path follows the name.
+    """Return every list of poses of a tree of mappings, lists and arrays; the key path follows the name.
 
     Raises:
         DatasetError: a node has the form of poses and holds none.
@@ -106,7 +106,7 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
 
 
 def _stack(values: list[Any], name: str, label: str) -> Array | None:
-    """The poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none.
+    """Return the poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none.
 
     None where most are no poses.
 
@@ -171,7 +171,7 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
 
 
 def _numbered(node: Mapping[Any, Any]) -> list[Mapping[Any, Any]]:
-    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1.
+    """Return the samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1.
 
     Empty where it has none.
     """
@@ -200,7 +200,7 @@ def _together(singles: list[tuple[str, Listing]], name: str, at: str) -> Iterato
 
 
 def _stem(key: str) -> str:
-    """A key without its last number."""
+    """Return a key without its last number."""
     return re.sub(r"\d+(?=\D*$)", "", key)
 
 
@@ -295,7 +295,7 @@ def _rotations_and_positions(R: Any, t: Any, label: str, key: str) -> Listing | 
 
 
 def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
-    """The numbers of a mapping by dotted name; short lists under telling names are spelled out."""
+    """Return the numbers of a mapping by dotted name; short lists under telling names are spelled out."""
     out: dict[str, float] = {}
     for key, value in node.items():
         path = f"{at}.{key}".strip(".").lower()
@@ -318,7 +318,7 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
 
 
 def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
-    """A rotation of an angle about an axis as a rotation vector; empty where the mapping is none."""
+    """Return a rotation of an angle about an axis as a rotation vector; empty where the mapping is none."""
     axis, angle = _array(value.get("axis")) if isinstance(value.get("axis"), list) else None, value.get("angle")
     if axis is None or axis.shape != (3,) or not isinstance(angle, int | float):
         return {}

@@ -174,7 +174,7 @@ def _same(one: ReadingAgreement, other: ReadingAgreement) -> bool:
 
 
 def _variants(robot: PoseReading, camera: PoseReading, changes: bool) -> list[tuple[PoseReading, PoseReading, int]]:
-    """The two readings as they are and with one change of one list ."""
+    """Return the two readings as they are and with one change of one list ."""
     found = [(robot, camera, 0)]
     if changes:
         found += [(robot.changed(c), camera, 1) for c in CHANGES]
@@ -183,7 +183,7 @@ def _variants(robot: PoseReading, camera: PoseReading, changes: bool) -> list[tu
 
 
 def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> list[tuple[int, int]]:
-    """Index pairs of readings whose relative rotations have equal angles, as far as the data can tell."""
+    """Return index pairs of readings whose relative rotations have equal angles within the noise."""
     n = len(robot[0].X)
     i, j = _pairs(n, _PAIRS)
     angles = [np.stack([_relative_angles(one.X[:, :3, :3], i, j) for one in listed]) for listed in (robot, camera)]
@@ -409,7 +409,7 @@ def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tup
 
 
 def _nearest_unit(scale: float) -> float | None:
-    """The ratio of two units of length that is nearest to a scale; None where none is near."""
+    """Return the ratio of two units of length that is nearest to a scale; None where none is near."""
     ratios = {a / b for a in UNITS.values() for b in UNITS.values()}
     near = min(ratios, key=lambda r: abs(np.log(scale / r)))
     return near if abs(np.log(scale / near)) < _NEAR_UNIT else None

@@ -115,7 +115,7 @@ def read_pairs(
 def pairs_of_lists(
     lists: list[Listing], names: str, *, mounting: str | None, length: str | None, stated: StatedForms
 ) -> PosePairs:
-    """The pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
+    """Return the pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
     mounting = None if mounting is None else mounting_name(mounting)
     return _pairs(Path(names), lists, {}, mounting, length, stated)
 
@@ -180,7 +180,7 @@ def _pairs(
 
 
 def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
-    """The lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
+    """Return the lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
     if path.is_dir():
         description = path / "dataset.yaml"
         raw = read_tree(description) if description.is_file() else {}
@@ -201,8 +201,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
     ending = path.suffix.lower()
     if ending in (".bag", ".db3", ".mcap"):
         raise DatasetError(
-            f"'{path.name}' is a ROS recording: write the robot's and the camera's poses as robot.csv and camera.csv"
-            " into a folder (rostopic echo -p, or ros2 topic echo --csv) and give that folder."
+            f"'{path.name}' is a ROS recording, which is not read. Write the robot's and the camera's poses as"
+            " robot.csv and camera.csv (rostopic echo -p, or ros2 topic echo --csv) into a folder, and give that folder."
         )
     if ending in (".pkl", ".pickle"):
         raise DatasetError(
@@ -238,8 +238,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         lists = lists_of_tree(tree, path.name)
         if len(lists) == 1 and len(lists[0]) == 1:
             raise DatasetError(
-                f"'{path.name}' holds one pose: it looks like the result of a calibration, and samples are needed. Give"
-                " the file of the samples, or judge this result on them with 'weldcal verify'."
+                f"'{path.name}' has only one pose, so it seems to be the result of a calibration. Give the file of the"
+                " samples instead. To test this result on the samples, use 'weldcal verify'."
             )
         return lists, raw
     lists = read_lists(path)

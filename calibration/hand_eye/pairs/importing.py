@@ -28,6 +28,7 @@ SCALE_SIGMA = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
 """A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
 _OTHER_SIZE = 2.0  # a choice: no board is measured wrong by a factor of 7
+_SQUARES_M = (0.005, 0.2)  # a choice: sizes of a board's squares, which some programs count
 LEAST_SCALE = 0.2  # a choice: 20 %, beyond a board's wrong scale, within a factor of unit
 """Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
 it."""
@@ -79,7 +80,7 @@ class ImportedPairs:
 
 
 def import_pairs(lists: list[Listing], source: str, mounting: str, stated: StatedForms) -> ImportedPairs:
-    """The pairs of two lists of poses, each read as the data and the user's statements say.
+    """Return the pairs of two lists of poses, each read as the data and the user's statements say.
 
     Args:
         lists: those of the source.
@@ -156,7 +157,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
 
 
 def _with_name(listing: Listing, form: PoseForm) -> PoseForm:
-    """The stated form, inverted where the list's name says so."""
+    """Return the stated form, inverted where the list's name says so."""
     return replace(form, frame="base_in_flange") if named_inverse(listing) and form.frame == "flange_in_base" else form
 
 
@@ -167,7 +168,7 @@ def _metric(X: Array, factor: float) -> Array:
 
 
 def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
-    """The chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
+    """Return the chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
     same = [one for one in listed if one.form == chosen.form]
     return min(same, key=lambda one: float(np.abs(one.X - chosen.X[0]).max(axis=(1, 2)).min()))
 
@@ -195,15 +196,15 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
     X = reading.X
     if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
         raise InconsistentPoses(
-            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}': it does not change while the other"
-            " list does. Check that each sample stores the present pose."
+            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}', but the other list changes. Check"
+            f" that each sample stores the pose that the {who} has at that moment."
         )
 
 
 def decided(
     a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int
 ) -> tuple[ReadingDecision | None, int]:
-    """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
+    """Return the decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
     if n < _FEWEST:
         return None, 0
     some = np.unique(np.linspace(0, n - 1, min(n, _MOST_COMPARED)).round().astype(int))
@@ -229,29 +230,30 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
         if decision.rivals or best.changed:
             runner = decision.rivals[0] if decision.rivals else best
             raise InconsistentPoses(
-                f"The poses of '{source}' contradict each other in every known reading. Best: {_pair_words(best)},"
-                f" {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that row k of both lists"
-                " is of the same moment, or state the forms with --robot-form and --camera-form."
+                f"The poses of '{source}' contradict each other in every known convention. The best is"
+                f" {_pair_words(best)}, {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that"
+                " row k of both lists was recorded at the same moment. Or state the conventions with --robot-form and"
+                " --camera-form."
             )
         return
     if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         form = best.robot.form if best.robot.form.endswith(",inverse") else f"{best.robot.form},inverse"
         raise InconsistentPoses(
-            f"The robot poses of '{source}' contradict the pictures as given ({mounting}), and agree"
-            f" ({_residual(best)}) in two ways that the data cannot tell apart: the camera is mounted {other}"
-            f" (--mounting {other}), or the robot poses are inverted (--robot-form {form}). State the one that is true."
+            f"With --mounting {mounting} the robot poses of '{source}' contradict the pictures. Two corrections fit"
+            f" equally well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), or the robot poses"
+            f" are inverted (--robot-form {form}). Give the option that is true."
         )
     if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         raise InconsistentPoses(
-            f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in"
-            f" three ways that the data cannot tell apart: the camera is mounted {other} (--mounting {other}), the"
-            f" robot poses are inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are"
-            f" inverted (--camera-form {_option(best.camera, 'inverse')}). State the one that is true."
+            f"With --mounting {mounting} the poses of '{source}' contradict each other. Three corrections fit equally"
+            f" well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), the robot poses are"
+            f" inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are inverted"
+            f" (--camera-form {_option(best.camera, 'inverse')}). Give the option that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
         raise InconsistentPoses(
-            f"The poses of '{source}' agree in more than one reading, and the results differ: {_pair_words(best)}"
+            f"The poses of '{source}' agree in two conventions, with different results: {_pair_words(best)}"
             f" ({_residual(best)}), or {_pair_words(rival)} ({_residual(rival)}). State the right one:"
             f" {_options(best)}, or {_options(rival)}."
         )
@@ -328,14 +330,14 @@ def _units(
             words[0] = "m"
         else:
             raise DatasetError(
-                f"The robot positions of '{source}' have a median of {median:.3g} from the base: that is neither metres"
-                " nor millimetres of an arm. State the unit with --unit m, mm, cm or inch."
+                f"The median distance of the robot positions of '{source}' from the base is {median:.3g}. An arm's"
+                " reach is neither that in metres nor in millimetres. State the unit with --unit m, mm, cm or inch."
             )
     unit_r = UNITS[words[0]]
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
         raise DatasetError(
-            f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]};"
-            " correct --unit."
+            f"Read in {words[0]}, the robot positions of '{source}' have a median distance of {median * unit_r:.3g} m"
+            " from the base. No arm has that reach: correct --unit."
         )
     ratio = None
     if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:
@@ -363,19 +365,19 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
     if near != unit and abs(np.log(ratio / UNITS[near])) < _OTHER_UNIT:
         raise InconsistentPoses(
-            f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct"
-            f" the unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
+            f"The camera positions of '{source}' fit the robot's motion in {near}, but {unit} is stated. Correct the"
+            f" unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
         )
-    if abs(np.log(factor)) > _OTHER_SIZE:
+    if abs(np.log(factor)) > _OTHER_SIZE and not _SQUARES_M[0] <= ratio <= _SQUARES_M[1]:
         raise InconsistentPoses(
-            f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g}: the"
-            " robot's or the camera's positions are in another unit, or of unknown scale. State the unit of both with"
-            " --unit, or multiply the positions of one list."
+            f"The camera positions of '{source}' fit the robot's motion only when multiplied by {factor:.4g}. One of"
+            " the two lists has another unit, or an unknown scale. State the unit of both with --unit, or multiply the"
+            " positions of one list."
         )
-    squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
+    squares = f", or the distances count squares of {ratio:.4g} m" if ratio < _SQUARES_M[1] else ""
     raise WrongScale(
         factor,
-        f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from"
-        f" {unit} to the right length): the size of the board's squares or of the marker is wrong by that"
-        f" factor{squares}, or they have another unit. Correct the size, or multiply the positions by {factor:.4g}.",
+        f"The camera positions of '{source}' ({unit}) fit the robot's motion only when multiplied by {factor:.4g}."
+        f" The size of the board's squares or of the marker is wrong by that factor{squares}, or the unit is another"
+        f" one. Correct the size, or multiply the positions by {factor:.4g}.",
     )

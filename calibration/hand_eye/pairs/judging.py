@@ -119,7 +119,7 @@ def judge_pose(
     the covariance C of the new solution (plus the stated one). If the stated pose is right, e' C^-1 e / 6 has the
     distribution F(6, degrees of freedom): for a linear problem it is the F test of the six more unknowns. The pairs
     show an error of six numbers with the probability POWER where its non-centrality is that of the non-central F
-    distribution; the longest displacement of the target with this non-centrality is ``shown_mm``.
+    distribution. The longest displacement of the target with this non-centrality is ``shown_mm``.
 
     Args:
         problem: full poses, X and Y free.
@@ -189,7 +189,7 @@ class _Measure:
         return float(np.sqrt(max(e @ self.M @ e, 0.0)))
 
     def other(self, X: Array) -> tuple[str, float] | None:
-        """The other form of X that fits, in words, with its displacement in mm; None where none does."""
+        """Return the other form of X that fits, in words, with its displacement in mm; None where none does."""
         own = self.size(difference(self.X, X))
         near = []
         for words, form in _other_forms(X):
@@ -260,7 +260,7 @@ def _axes() -> list[Array]:
 
 
 def _noncentrality(critical: float, freedom: float) -> float:
-    """The non-centrality at which F(6, freedom) exceeds ``critical`` with the probability POWER."""
+    """Return the non-centrality at which F(6, freedom) exceeds ``critical`` with the probability POWER."""
 
     def lacking(value: float) -> float:
         return float(ncfdtr(6.0, freedom, value, critical)) - (1.0 - POWER)
@@ -272,7 +272,7 @@ def _noncentrality(critical: float, freedom: float) -> float:
 
 
 def _target(problem: Problem, X: Array, rows: Flags) -> Array:
-    """The best Y (4, 4) for X: the mean of F X G."""
+    """Return the best Y (4, 4) for X: the mean of F X G."""
     P = (problem.F @ X @ problem.G)[rows]
     Y = np.eye(4)
     Y[:3, :3] = nearest_rotation(P[:, :3, :3].sum(axis=0)[None])[0]

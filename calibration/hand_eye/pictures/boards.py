@@ -70,7 +70,7 @@ class Board:
     radius: float = 0.0
 
     def __str__(self) -> str:
-        """The string that describes the board."""
+        """Return the string that describes the board."""
         grid, size, inner = f"{self.columns}x{self.rows}", f"{1e3 * self.size:g}", f"{1e3 * self.inner:g}"
         if self.kind in ("charuco", "tags"):
             return f"{self.kind}:{grid}:{size}:{inner}:{self.dictionary}"
@@ -78,7 +78,7 @@ class Board:
 
     @property
     def layouts(self) -> int:
-        """Number of layouts that share the string and that pictures tell apart."""
+        """Return the number of layouts that share the string and that pictures distinguish."""
         if self.kind == "charuco":
             return 2 if self.rows % 2 == 0 else 1
         return 8 if self.kind == "tags" else 1
@@ -151,7 +151,7 @@ def dictionary(name: str) -> Any:
 
 
 def parse_board(text: str) -> Board:
-    """The board that a string describes; see FORMS.
+    """Return the board that a string describes; see FORMS.
 
     Raises:
         DatasetError: it describes none; the sentence has the form and an example.
@@ -226,7 +226,7 @@ def find_board(grey: Grey, board: Board) -> Array:
 
 
 def with_layout(greys: Sequence[Grey], board: Board) -> Board:
-    """The board with the layout that agrees best with the pictures."""
+    """Return the board with the layout that agrees best with the pictures."""
     if board.layouts == 1:
         return board
     if board.kind == "charuco":
@@ -256,7 +256,7 @@ def _off_plane(points: Array | None, board: Board) -> float | None:
 
 
 def _right_handed(points: Array, columns: int, rows: int) -> bool:
-    """Whether the columns go to the right of the rows' direction, as they do on a board that is seen from its front."""
+    """Return whether the columns go to the right of the rows' direction, as on a board from its front."""
     grid = points.reshape(rows, columns, 2)
     right, down = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0), grid[-1].mean(axis=0) - grid[0].mean(axis=0)
     return bool(right[0] * down[1] - right[1] * down[0] > 0.0)
@@ -298,7 +298,7 @@ def _search(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Arra
 
 
 def _dark(grey: Grey, grid: Array) -> bool:
-    """Whether the square between the first four corners is darker than its neighbours."""
+    """Return whether the square between the first four corners is darker than its neighbours."""
     centre = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     u = np.clip(np.rint(centre).astype(int), 0, [grey.shape[1] - 1, grey.shape[0] - 1])
     value = grey[u[..., 1], u[..., 0]].astype(float)
@@ -469,7 +469,7 @@ def _centres(grey: Grey, points: Array, colour: int) -> tuple[Array, Array]:
 
 
 def _in_order(points: Array, board: Board) -> NDArray[np.int64]:
-    """The order (m,) in which points that OpenCV found are the board's."""
+    """Return the order (m,) in which points that OpenCV found are the board's."""
     order = np.arange(len(points)).reshape(board.rows, board.columns)
     if not _right_handed(points, board.columns, board.rows):
         order = order[:, ::-1] if board.kind == "circles" else order[::-1]

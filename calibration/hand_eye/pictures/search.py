@@ -124,7 +124,7 @@ def picture_files(folder: Path, named: str | None = None) -> list[Path]:
 
 
 def camera_in(folder: Path) -> tuple[Path, CameraFile] | None:
-    """The file of a folder that is named as a camera's and states one, or None."""
+    """Return the file of a folder that is named as a camera's and states one, or None."""
     found = [p for pattern in ("*", "*/*") for p in sorted(folder.glob(pattern)) if p.is_file()]
     for path in found:
         if path.suffix.lower() in _CAMERA_ENDINGS and _CAMERA.match(path.stem):
@@ -136,7 +136,7 @@ def camera_in(folder: Path) -> tuple[Path, CameraFile] | None:
 
 
 def load_grey(path: Path) -> NDArray[np.uint8] | None:
-    """A picture in 8 bits of grey; None where it cannot be read."""
+    """Return a picture in 8 bits of grey; None where it cannot be read."""
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError:
@@ -156,7 +156,7 @@ def load_grey(path: Path) -> NDArray[np.uint8] | None:
 
 
 def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, list[Picture]]:
-    """The board in every picture, on two threads.
+    """Return the board in every picture, on two threads.
 
     Raises:
         DatasetError: it is in fewer than four; the sentence says what was found in its place.
@@ -223,13 +223,13 @@ def _thumbnail(grey: NDArray[np.uint8], points: Array) -> bytes:
 
 
 def common_size(pictures: Sequence[Picture]) -> tuple[int, int]:
-    """The size of most pictures in which the board was found."""
+    """Return the size of most pictures in which the board was found."""
     sizes = [p.size for p in pictures if not p.why]
     return max(set(sizes), key=sizes.count)
 
 
 def sized(picture: Picture, size: tuple[int, int]) -> Picture:
-    """The picture, not used where it has another size."""
+    """Return the picture, not used where it has another size."""
     if picture.why or picture.size == size:
         return picture
     return replace(
@@ -260,9 +260,9 @@ def _estimate(
     if file is not None:
         if file.size is not None and file.size != size:
             raise DatasetError(
-                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, and these"
-                f" have {size[0]} x {size[1]}: give the file of this resolution, or leave it out to estimate the"
-                " camera."
+                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, but these"
+                f" have {size[0]} x {size[1]}. Give the file of this resolution, or leave it out: the camera is then"
+                " estimated."
             )
         return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
     start = np.array(
@@ -299,8 +299,9 @@ def _estimate(
             free = np.append(free, 8)
     if not (0.2 * max(size) < K[0, 0] < 50.0 * max(size)) or not np.isfinite(dist).all():
         raise DatasetError(
-            f"The pictures do not determine the camera (focal length {K[0, 0]:.0f} px of {size[0]} pixels): tilt the"
-            " board by 20 to 40 degrees in some pictures, or give the camera with --intrinsics FILE."
+            f"The camera cannot be estimated from these pictures: a focal length of {K[0, 0]:.0f} px for pictures"
+            f" {size[0]} pixels wide is impossible. Tilt the board by 20 to 40 degrees in some pictures, or give the"
+            " camera with --intrinsics FILE."
         )
     return K, dist, free.astype(np.int64), pictures
 

@@ -67,7 +67,7 @@ def read_pictures(
     stated: StatedForms | None = None,
     camera: Path | None = None,
 ) -> PictureSet:
-    """The pictures of a folder with the robot's poses.
+    """Return the pictures of a folder with the robot's poses.
 
     Args:
         folder: it holds the pictures and the robot's poses in any form of docs/datasets.md; ``--camera-poses`` of
@@ -186,8 +186,8 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
         lists = mine if len(mine) == 1 else others if len(others) == 1 else lists
     if len(lists) > 1:
         raise DatasetError(
-            f"The names of the lists of '{folder.name}' do not tell the robot's poses: {known}. Name them with"
-            " --robot-poses."
+            f"The names of the lists in '{folder.name}' do not show which one has the robot's poses: {known}. Name it"
+            " with --robot-poses."
         )
     return replace(lists[0], unit=lists[0].unit or unit or "")
 
@@ -256,7 +256,7 @@ def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
 
 
 def _flipped(C: Array, labels: NDArray[np.int64], board: Board) -> Array:
-    """The boards' poses with another order of their points."""
+    """Return the boards' poses with another order of their points."""
     turns = [_turn(board, order) for order in board.symmetries]
     return np.stack([X @ turns[int(k)] for X, k in zip(C, labels, strict=True)])
 

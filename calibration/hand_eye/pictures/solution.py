@@ -246,7 +246,7 @@ def adjust(
 
 
 def _moved(sigma: float, square: float, least: float) -> float:
-    """The next standard deviation: at most a factor of five from the last."""
+    """Return the next standard deviation: at most a factor of five from the last."""
     return max(float(np.clip(np.sqrt(max(square, 0.0)), sigma / 5.0, 5.0 * sigma)), least)
 
 
@@ -428,7 +428,7 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
-    """The pairs with, for each picture, the solution that lies nearest to what the result predicts.
+    """Return the pairs with, for each picture, the solution that lies nearest to what the result predicts.
 
     a plane and a symmetric board have several.
     """

@@ -1,1 +1,1 @@
-"""Watching a calibration in motion: residuals, their noise, the sequential test, what can be told of the cause."""
+"""Monitor a calibration in motion: residuals, their noise, the sequential test, the possible causes."""

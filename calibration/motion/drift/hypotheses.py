@@ -51,7 +51,7 @@ class PoseField:
         return len(self) >= self.config.largest
 
     def copy(self) -> "PoseField":
-        """A field that grows by itself from here on; its arrays are never changed in place."""
+        """Return a field that grows by itself from here on; its arrays are never changed in place."""
         out = PoseField(self.config)
         out._poses, out._factor = self._poses, self._factor
         return out
@@ -93,7 +93,7 @@ class FilterConfig:
     """What is known before.
 
     The sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander in a cell in
-    which nothing happens; ``change`` (SIZE,) is how large a change may be.
+    which nothing happens. ``change`` (SIZE,) is how large a change may be.
     """
 
     clock_s: float = 5e-3
@@ -163,7 +163,7 @@ class DriftFilter:
         return self._P[:SIZE, :SIZE].copy()
 
     def copy(self) -> "DriftFilter":
-        """A filter with the same estimate and field, without hypotheses."""
+        """Return a filter with the same estimate and field, without hypotheses."""
         out = DriftFilter(np.eye(6), self.config)
         out._x, out._P, out._n = self._x.copy(), self._P.copy(), self._n
         out._field, out._time, out.count = self._field.copy(), self._time, self.count
@@ -298,7 +298,7 @@ class DriftFilter:
         self.clear()
 
     def _least_missed(self, slots: NDArray[np.intp]) -> int:
-        """The hypothesis whose neighbours in time stand for it best: they stay closer the younger they are."""
+        """Return the hypothesis whose neighbours in time stand for it best: they stay closer the younger they are."""
         order = slots[np.argsort(self.start[slots])]
         s = self.start[order].astype(float)
         gap = (s[2:] - s[:-2]) / (self.count - s[1:-1] + 8.0)

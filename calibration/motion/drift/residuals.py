@@ -97,7 +97,7 @@ def rows_of(
     covariances: Array,
     normal_sigmas: Array,
 ) -> Rows:
-    """The same from arrays.
+    """Return the same from arrays.
 
     Times (n,), p_BR, n_B, v_BR, turn_B, p_CR, n_C (n, 3), covariances (n, 3, 3), normal_sigmas (n,).
     """
@@ -126,7 +126,7 @@ def rows_of(
 
 
 def about(covariance: Array, lever: Array) -> Array:
-    """A covariance (6, 6) [rotation; translation] about one point, as of a point ``lever`` (3,) m farther."""
+    """Return a covariance (6, 6) [rotation; translation] about one point, as of a point ``lever`` (3,) m farther."""
     A = np.eye(6)
     A[3:, :3] = -skew(lever)
     return np.asarray(A @ covariance @ A.T)
@@ -171,7 +171,7 @@ class NoiseMemory:
         self._mean = np.zeros(3)  # logarithms
 
     def noise(self, window: FrameNoise, new: int) -> FrameNoise:
-        """The noise after a window with ``new`` frames more than the one before it."""
+        """Return the noise after a window with ``new`` frames more than the one before it."""
         now = np.log([window.center, window.normal, max(window.jitter_s, _LEAST_JITTER_S)])
         self._count = min(self._count + new, self._most)
         self._mean += (now - self._mean) * min(new / self._count, 1.0)
@@ -180,7 +180,7 @@ class NoiseMemory:
 
 
 def measured_noise(rows: Rows, *, clock_s: float = 0.0) -> FrameNoise | None:
-    """The noise in rows (n) in the order of their times; None where fewer than LEAST triples follow each other.
+    """Return the noise in rows (n) in the order of their times; None where fewer than LEAST triples follow each other.
 
     Second differences of neighbours cancel what varies slowly: the calibration's error, a change of the pose, the
     scanner's warp along the path. ``clock_s`` is a known error of the clock, which acceleration would leave in them.

@@ -1,4 +1,4 @@
-"""Sequential test of a calibration: has the scanner moved, when, by how much and which way."""
+"""Test a calibration sequentially: has the scanner moved, when, by how much and in which direction."""
 
 from dataclasses import dataclass, field
 
@@ -39,8 +39,8 @@ class DriftConfig:
     """Settings of the test. ``false_alarms_per_hour`` bounds the alarms in a cell in which nothing happens.
 
     ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of
-    frames averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a
-    change that is as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not
+    frames averages away. ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a
+    change that is as old as the first frame. It is tested for ``stated_s``. Changes older than ``longest_s`` are not
     tested. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up
     explains a slow change as well. The noise is that of the last ``noise_frames``, and no less than the mean of the
     last ``noise_memory``. Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not
@@ -138,11 +138,11 @@ class DriftTest:
 
     @property
     def alarmed(self) -> bool:
-        """Whether an alarm stands whose size is still being measured."""
+        """Return whether an alarm is active whose size is still being measured."""
         return self._alarm_s is not None
 
     def current(self) -> tuple[RigidTransform, Array]:
-        """The scanner's pose as it is now, and its covariance (6, 6) [rotation.
+        """Return the scanner's pose as it is now, and its covariance (6, 6) [rotation.
 
         Translation] about the camera's origin: the calibration, corrected by what all frames since the last change say.
         This is the recalibration.
@@ -179,7 +179,7 @@ class DriftTest:
         return out
 
     def finish(self) -> list[DriftEvent]:
-        """No more frames: settle an alarm that stands.
+        """Complete an active alarm after the last frame.
 
         Frames too few for their noise to be measured are tested with the stated one.
         """
@@ -261,7 +261,7 @@ class DriftTest:
             self._alarm_s, self._settles_s = t, t + self.config.confirm_s
 
     def _settle(self, t: float, *, last: bool = False) -> list[DriftEvent]:
-        """The event of the best hypothesis; the filter goes on from the pose after it.
+        """Return the event of the best hypothesis; the filter goes on from the pose after it.
 
         An alarm that has faded is withdrawn.
         """

@@ -1,4 +1,4 @@
-"""Watch a calibration over a recording: synchronise, test for drift, tell scanner from base, recalibrate."""
+"""Monitor a calibration over a recording: synchronise, test for drift, separate scanner from base, recalibrate."""
 
 import warnings
 from collections.abc import Sequence
@@ -96,7 +96,7 @@ def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: Rigid
 
 
 def _median(clouds: Sequence[Array]) -> tuple[Array, Mask]:
-    """Median point of each pixel (H, W, 3), and whether it shows one thing that stands still."""
+    """Return the median point of each pixel (H, W, 3), and whether the pixel shows one object at rest."""
     z = np.stack([c[..., 2] for c in clouds])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame measured
@@ -125,8 +125,8 @@ def _normals(p: Array) -> tuple[Array, Mask]:
 class DriftHistory:
     """What a recording says of a calibration, for its N tracked frames in the order of their times.
 
-    ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and
-    ``tilts`` (N, 2) rad those after each frame's own time is taken out as far as the jitter allows; ``offsets`` (N,) s
+    ``rows`` are the residuals against the calibration at the nominal capture times. ``residuals`` (N, 3) m and
+    ``tilts`` (N, 2) rad those after each frame's own time is taken out as far as the jitter allows. ``offsets`` (N,) s
     is by how much each frame was later than nominal. ``before`` (N, 3) m are the residuals of frames taken for as old
     as their arrival, ``after`` (N, 3) m those against the pose that held at the time. ``gross`` (N,) frames show
     something else. ``statistic`` (N,) is the drift test's largest, over ``threshold``. ``X_BC`` and ``covariance`` (6,
@@ -193,7 +193,7 @@ def watch(
 def drift_config(
     sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
-    """The test's settings for a calibration.
+    """Return the test's settings for a calibration.
 
     Its spread of scanner and arm is that of the field, where it states a larger one.
     """
@@ -225,7 +225,7 @@ def _tested(
     pivot = at.p[order].mean(axis=0)
 
     def rows_with(p_C: Array, n_C: Array) -> Rows:
-        """The residuals with these centres and normals of the frames."""
+        """Return the residuals with these centres and normals of the frames."""
         seen = (p_C, n_C, frames.covariance, frames.normal_sigma)
         return rows_of(result.X_BC, pivot, *(a[order] for a in (clock.times, at.p, at.n, at.v, at.turn, *seen)))
 
@@ -300,7 +300,7 @@ def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
 def _as_before(
     X_BC: RigidTransform, moves: Sequence[DriftEvent], times: Array, frames: ObservedFrames
 ) -> tuple[Array, Array]:
-    """Centres and normals (N, 3) as the scanner would have seen them from X_BC, had it not moved.
+    """Return centres and normals (N, 3) as the scanner would have measured them from X_BC, had it not moved.
 
     A creep counts from its middle.
     """

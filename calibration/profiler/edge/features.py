@@ -23,7 +23,7 @@ MINIMUM_JUMP_M = {"bar": 5e-3, "step": 0.5e-3}
 
 
 def extract_edge(profile: ArrayLike, kind: Kind, side: Literal["left", "right"] = "left") -> tuple[Floats, Floats]:
-    """The edge's point in a profile and its sigma, both (2,) [x, z] m.
+    """Return the edge's point in a profile and its sigma, both (2,) [x, z] m.
 
     Args:
         profile: (n, 2) [x, z] m, z growing away from the sensor; NaN where nothing returned.
@@ -49,7 +49,7 @@ def extract_edge(profile: ArrayLike, kind: Kind, side: Literal["left", "right"] 
 
 
 def _end(p: Floats, pitch: float, jump_m: float) -> tuple[Floats, Floats]:
-    """The first sample of the near face, less half a pitch; its height from a line through the face."""
+    """Return the first sample of the near face, less half a pitch; its height from a line through the face."""
     x, z = p[:, 0], median_filter(p[:, 1], MEDIAN, mode="nearest")
     drop = z[: -MEDIAN + 1] - z[MEDIAN - 1 :]  # across the filter's own length
     for k in np.argsort(-drop):
@@ -88,7 +88,9 @@ def _apex(p: Floats, pitch: float) -> tuple[Floats, Floats]:
             reach = sign * (x - at)
             flank = (reach > pitch) & (reach < FLANK_M)
             if flank.sum() < MINIMUM_RUN:
-                raise FeatureNotFound("The profile shows no two flanks of a blade: move until both sides are seen.")
+                raise FeatureNotFound(
+                    "The profile does not show both flanks of the blade: move until both are visible."
+                )
             lines.append(_robust_line(x[flank], p[flank, 1]))
         (a1, b1, s1, n1), (a2, b2, s2, n2) = lines
         if not (b1 < b2 and abs(b2 - b1) > 0.2):

@@ -1,7 +1,7 @@
 """Estimate X_FS from one straight edge in any poses: starts from 24 orientations, then one least-squares problem.
 
 Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor
-and robot), with a Cauchy loss that keeps 95 % of what least squares would get; the covariance is the Cramer-Rao bound
+and robot), with a Cauchy loss that keeps 95 % of what least squares would get. The covariance is the Cramer-Rao bound
 over that share, where the stated sigmas are right.
 
 The starts minimise the distance of a point to a line: it has no division by the angle between edge and scan plane, so
@@ -46,7 +46,7 @@ NEAR, SETTLED = 1e-2, 1e-7  # in sigmas of the unknowns: steps that end the desc
 
 
 def cube_rotations() -> Floats:
-    """The 24 rotations (24, 3, 3) that bring a cube onto itself."""
+    """Return the 24 rotations (24, 3, 3) that bring a cube onto itself."""
     found = []
     for axes in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
@@ -58,7 +58,7 @@ def cube_rotations() -> Floats:
 
 
 def edge_starts(poses: FlangePoses, p: Floats) -> list[EdgeState]:
-    """The best different optima, best first."""
+    """Return the best different optima, best first."""
     R, t, point, e, cost = _point_to_line(poses, p)
     chosen = distinct(R, np.argsort(cost))
     return [EdgeState(R[k], t[k], point[k], e[k]) for k in chosen]
@@ -175,7 +175,7 @@ def edge_joint(
     sigma_xz_m: ArrayLike,
     init: EdgeState | None = None,
 ) -> EdgeEstimate:
-    """The pose of a profiler on the flange, from points of one straight edge.
+    """Return the pose of a profiler on the flange, from points of one straight edge.
 
     Args:
         rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m; points: (n, 2) profile points [x, z] m of the edge.

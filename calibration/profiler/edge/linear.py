@@ -1,7 +1,7 @@
 """The straight-edge paper's method: X_FS in two linear steps from a grid of rotations and translations.
 
 As published it answers some degenerate motions with confident nonsense (collinear translations: 93 degrees off),
-because the rank of its matrix does not show them in noise; here these motions are named and refused. Kept beside
+because the rank of its matrix does not show them in noise. Here these motions are named and refused. Kept beside
 edge_joint to compare.
 """
 

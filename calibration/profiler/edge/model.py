@@ -87,7 +87,7 @@ def left_covariance(rotation: Floats, covariance: Floats) -> Floats:
 
 
 def left_information(rotation: Floats, information: Floats) -> Floats:
-    """The same for an information matrix (6, 6)."""
+    """Return the same for an information matrix (6, 6)."""
     T = np.eye(6)
     T[:3, :3] = rotation
     return np.asarray(T @ information @ T.T)  # T is orthogonal

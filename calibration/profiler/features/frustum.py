@@ -81,7 +81,7 @@ def _normals(p: Floats) -> Floats:
 
 
 def _main_direction(normals: Floats) -> Floats:
-    """The direction that most normals have: base and top are parallel.
+    """Return the direction that most normals have: base and top are parallel.
 
     The sides' mean outward direction says which way is up.
     """
@@ -106,7 +106,7 @@ def _azimuth(normals: Floats, up: Floats) -> Floats:
 
 
 def _split(p: Floats, normals: Floats, up: Floats) -> NDArray[np.intp]:
-    """A first label (n,) for each point: 0 base, 1 top, 2 to 5 the sides, -1 not clear."""
+    """Return a first label (n,) for each point: 0 base, 1 top, 2 to 5 the sides, -1 not clear."""
     labels = np.full(len(p), -1, dtype=np.intp)
     flat = np.abs(normals @ up) > SIDE_COSINE
     height = p @ up
@@ -207,7 +207,7 @@ def _measured(p: Floats, labels: NDArray[np.intp], planes: Floats) -> Frustum:
 
 
 def without_spikes(profile: ArrayLike, limit_m: float = 1e-3) -> Floats:
-    """The samples of a profile (n, 2) m that returned and do not stand out of their neighbours by the limit."""
+    """Return the samples of a profile (n, 2) m that returned and do not stand out of their neighbours by the limit."""
     p = np.asarray(profile, float)
     p = p[np.isfinite(p).all(axis=1)]
     return np.asarray(p[np.abs(p[:, 1] - median_filter(p[:, 1], 7, mode="nearest")) < limit_m])

@@ -83,7 +83,7 @@ class _Line:
 
     Its coefficients (k,) and their covariance, and the sigma of a sample across it.
 
-    Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may
+    Straight where the samples show no bend. `unseen` are then the squares (m) that coefficients of higher powers may
     still have, each with what of its power (m, 4) the polynomial leaves.
     """
 
@@ -215,7 +215,7 @@ def _meet(one: _Line, two: _Line) -> float:
 
 
 def _crossing(one: _Line, two: _Line) -> tuple[Floats, Floats]:
-    """The intersection (2,) and its sigma (2,), by the covariances of both lines."""
+    """Return the intersection (2,) and its sigma (2,), by the covariances of both lines."""
     x = _meet(one, two)
     (z, b1, v1), (_, b2, v2) = one.at(x), two.at(x)
     lean = b2 - b1

@@ -54,7 +54,7 @@ STARTS = (1.0, 0.5, 2.0)  # times the stated radius: as given, a diameter given,
 def sphere_starts(
     poses: FlangePoses, profiles: Sequence[Floats], radius_m: float
 ) -> list[tuple[Floats, Floats, Floats]]:
-    """The best different optima (R_FS, p_FS, centre in B), best first."""
+    """Return the best different optima (R_FS, p_FS, centre in B), best first."""
     some = [p[np.linspace(0, len(p) - 1, POINTS).astype(int)] for p in profiles]
     p = np.vstack(some)
     of = np.repeat(np.arange(len(some)), POINTS)
@@ -171,7 +171,7 @@ class ModelChoice:
 def sphere_joint(
     data: SphereData, model: Model = "affine", sigmas: SphereSigmas | None = None, init: SphereEstimate | None = None
 ) -> SphereEstimate:
-    """The pose of a profiler on the flange from profiles of a sphere, and touches of it where there are any.
+    """Return the pose of a profiler on the flange from profiles of a sphere, and touches of it where there are any.
 
     Without `init` the 24 orientations of a cube are tried.
 
@@ -212,7 +212,7 @@ def sphere_joint(
 
 
 def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, OptimizeResult]]:
-    """The optima of the rigid model from the 24 orientations of a cube, best first.
+    """Return the optima of the rigid model from the 24 orientations of a cube, best first.
 
     a rotation R_FS (3, 3), and the solution about it.
 
@@ -228,7 +228,7 @@ def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, 
 
 
 def _started(init: SphereEstimate, data: SphereData, layout: ParameterLayout) -> Floats:
-    """The unknowns of an estimate, but for its pose."""
+    """Return the unknowns of an estimate, but for its pose."""
     parts = [np.zeros(6), init.center]
     if layout.tip:
         parts.append(np.zeros(3) if init.tip is None or data.tip is None else init.tip - data.tip)
@@ -395,7 +395,7 @@ class FreeRadius:
 
 
 def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeRadius | None:
-    """The radius by the scans alone (rigid sensor, no touches), from a start; None where it does not settle.
+    """Return the radius by the scans alone (rigid sensor, no touches), from a start; None where it does not settle.
 
     Gauss-Newton in the radius, all other unknowns solved at each step.
     """

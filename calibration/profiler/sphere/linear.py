@@ -108,7 +108,7 @@ def sphere_linear(
 def wrong_sides(
     rotation: ArrayLike, translation: ArrayLike, centers: ArrayLike, translated: ArrayLike
 ) -> tuple[int, ...]:
-    """Scans whose centre is on the other side of the scan plane than was said.
+    """Return the scans whose centre is not on the stated side of the scan plane.
 
     With it mirrored, all centres agree far better.
 
@@ -150,7 +150,7 @@ def fit_touch_sphere(
     solve_tip: bool = False,
     solve_radius: bool = False,
 ) -> TouchSphere:
-    """The sphere that the tip touched, and on wish the tip (orientations must vary) or the radius with it.
+    """Return the sphere that the tip touched, and on wish the tip (orientations must vary) or the radius with it.
 
     Args:
         rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m, at each touch; tip: (3,) m in F, as far as it is known.
@@ -166,7 +166,9 @@ def fit_touch_sphere(
             f"{len(poses)} touches are too few: touch the sphere all around, {MINIMUM_TOUCHES + 4} times or more."
         )
     if solve_tip and rotation_axes_spread(poses.rotation) < ONE_AXIS:
-        raise DegenerateMotion("The tip was asked for, but the flange kept its orientation: tilt it between touches.")
+        raise DegenerateMotion(
+            "The tip cannot be solved: the flange has one orientation in all touches. Tilt it between touches."
+        )
     tip_0 = np.asarray(tip, float)
     at = np.einsum("nij,j->ni", poses.rotation, tip_0) + poses.translation
     A = np.column_stack([2.0 * at, np.ones(len(at))])
@@ -209,7 +211,7 @@ def fit_touch_sphere(
 def compensate(
     start: SphereLinear, rotation: ArrayLike, translation: ArrayLike, centers: ArrayLike, touched: ArrayLike
 ) -> SphereLinear:
-    """The paper's compensation (Eq. 9): six parameters that bring the seen centres (n, 3) to the touched one (3,)."""
+    """Fit the paper's compensation (Eq. 9): six parameters from measured centres (n, 3) to the touched one (3,)."""
     poses = FlangePoses.checked(rotation, translation)
     P, c = np.asarray(centers, float), np.asarray(touched, float)
 

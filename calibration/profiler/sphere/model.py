@@ -70,7 +70,7 @@ class SphereData:
     touch_q: Floats | None = None
 
     def without(self, *scans: int) -> SphereData:
-        """The same but for these scans."""
+        """Return the same but for these scans."""
         keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
         profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
@@ -88,7 +88,7 @@ def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Where each unknown stands in the vector: pose, centre, tip, affine, joints."""
+    """Hold the index of each unknown in the vector: pose, centre, tip, affine, joints."""
 
     tip: bool
     affine: bool
@@ -117,8 +117,8 @@ class ParameterLayout:
 class _Points(NamedTuple):
     """Where the unknowns `x`, with the turn `R0` before them, place everything.
 
-    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m,
-    3, 3): of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by
+    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches. `rotation` (m,
+    3, 3): of the flange at each point. `R`: of the sensor. `turned` (m, 3): the points about the sensor's origin, by
     F's axes.
     """
 
@@ -193,7 +193,7 @@ class SphereProblem:
         return points.at, points.felt, points.poses
 
     def _points(self, x: Floats) -> _Points:
-        """The points placed by x.
+        """Return the points placed by x.
 
         The last answer is kept: a solver asks for residuals and derivatives at the same x.
         """

@@ -45,7 +45,7 @@ def check_wrist(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> No
     if -np.sign(p_TC[2]) * across > _BEHIND_M + _BEHIND_SIGMAS * unsure:
         raise TabletDataError(
             f"Camera and pen are on different sides of the page ({1e3 * abs(p_TC[2]):.0f} and {1e3 * abs(across):.0f}"
-            " mm from it), so it is mirrored in touches or image: check that x is before y in touches and landmarks,"
+            " mm from it). The touches or the image are mirrored: check that x is before y in touches and landmarks,"
             " and u before v in the image."
         )
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
@@ -100,7 +100,7 @@ def touched_scale(data: WristTouches) -> tuple[float, float]:
 
 
 def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> str:
-    """The likeliest cause of touches that do not fit, in a sentence."""
+    """Return the likeliest cause of touches that do not fit, in a sentence."""
     plain = f"The touches fit to {1e3 * left_m:.1f} mm only"
     if len(names) >= _LEAST_TO_DOUBT:
         without = [_misfit(data.pick(np.arange(len(names)) != k)) for k in range(len(names))]
@@ -142,6 +142,6 @@ def _misfit(data: WristTouches) -> float:
 
 
 def _rolled(X: RigidTransform, places: int) -> RigidTransform:
-    """The pose whose quaternion's numbers stand so many places off their columns w, x, y, z."""
+    """Return the pose whose quaternion's numbers stand so many places off their columns w, x, y, z."""
     wxyz = np.roll(X.rotation().ToQuaternion().wxyz(), places)
     return RigidTransform(RotationMatrix(Quaternion(wxyz)), X.translation())

@@ -50,8 +50,8 @@ def grid_columns(shown_px: Mapping[int, Array]) -> tuple[int, int]:
         if square and right[0] * down[1] - right[1] * down[0] > 0.0:
             return columns, int(row.max()) + 1
     raise TabletDataError(
-        "The numbers and coordinates of the landmarks make no grid row by row from 0; give --seen instead of the"
-        " picture."
+        "The landmarks are not a grid that is numbered row by row from 0, which a search in the picture needs. Give"
+        " their pixels with --seen instead of the picture."
     )
 
 
@@ -86,7 +86,7 @@ def read_table(path: Path, columns: Sequence[str]) -> list[Row]:
 
 
 def number(row: Row, column: str, path: Path) -> float:
-    """The finite number of a column; raises TabletDataError."""
+    """Return the finite number of a column; raises TabletDataError."""
     try:
         value = float(row[column])
     except ValueError:
@@ -99,7 +99,7 @@ def number(row: Row, column: str, path: Path) -> float:
 
 
 def landmark(row: Row, path: Path) -> int:
-    """The landmark's number, from 0; raises TabletDataError."""
+    """Return the landmark's number, from 0; raises TabletDataError."""
     value = number(row, "landmark", path)
     if value < 0.0 or value != int(value):
         raise TabletDataError(f"'{path.name}': landmarks are whole numbers from 0, not '{row['landmark'][:40]}'.")
@@ -254,7 +254,7 @@ def load_visit(
         found = find_page(picture, shown, look)
         uv = found[used]
     else:
-        raise TabletDataError("Give the camera's image (--image) or where the landmarks are in it (--seen).")
+        raise TabletDataError("Give the camera's image (--image), or the pixels of the landmarks in it (--seen).")
     corner = landmarks.min(axis=0)
     data = WristTouches(
         X_BF=tuple(pose_of[k] for k in used),
@@ -269,7 +269,7 @@ def load_visit(
 
 
 def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:
-    """The flange where the image was taken, and at each landmark."""
+    """Return the flange where the image was taken, and at each landmark."""
     found: dict[int, RigidTransform] = {}
     X_camera: RigidTransform | None = None
     for row in read_table(path, POSE_COLUMNS):

@@ -26,8 +26,8 @@ _TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by ze
 class WristTouches:
     """Touches and images of one visit, SI units.
 
-    ``X_BF`` flange in the base at each of n touches; ``touched_m`` and ``landmark_m`` (n, 2) on the tablet; ``views``:
-    for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks; ``focal_px`` of the camera
+    ``X_BF`` flange in the base at each of n touches. ``touched_m`` and ``landmark_m`` (n, 2) on the tablet. ``views``:
+    for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks. ``focal_px`` of the camera
     (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP
     then means: however the pen leans, the centre stands that far above the point it touches.
     """
@@ -40,7 +40,7 @@ class WristTouches:
     tip_radius_m: float = 0.0
 
     def pick(self, keep: NDArray[np.bool_]) -> WristTouches:
-        """The same visit with these landmarks only."""
+        """Return the same visit with these landmarks only."""
         poses = tuple(X for X, k in zip(self.X_BF, keep, strict=True) if k)
         views = tuple((X, rays[keep]) for X, rays in self.views)
         return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px, self.tip_radius_m)
@@ -160,7 +160,7 @@ def _axis_spread(poses: tuple[RigidTransform, ...]) -> float:
 
 
 def linear_system(data: WristTouches) -> tuple[Array, Array]:
-    """A (3 n, 12) and b (3 n,) of R_BF p_FP + p_BF = r1 x + r2 y + p_BT in r1, r2, p_BT and p_FP, three each."""
+    """Return a (3 n, 12) and b (3 n,) of R_BF p_FP + p_BF = r1 x + r2 y + p_BT in r1, r2, p_BT and p_FP, three each."""
     A = np.zeros((len(data.X_BF), 3, 12))
     for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
         A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
@@ -169,7 +169,7 @@ def linear_system(data: WristTouches) -> tuple[Array, Array]:
 
 
 def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransform, Array]:
-    """Closed form: R_BF p_FP + p_BF = r1 x + r2 y + p_BT for twelve unknowns, the open ones kept at the prior."""
+    """Solve R_BF p_FP + p_BF = r1 x + r2 y + p_BT in closed form for twelve unknowns, the open ones at the prior."""
     A, b = linear_system(data)
     # columns to a like size, so that what is open is left at its prior and not shared out by units
     guess = np.r_[np.zeros(11), 0.0 if pen_length_m is None else pen_length_m]

@@ -62,7 +62,7 @@ class Source(Protocol[Datum]):
         """Connect. Raises DeviceLost."""
 
     def next(self, timeout_s: float) -> "Delivery[Datum] | None":
-        """The next frame; None where none came in time.
+        """Return the next frame; None where none came in time.
 
         Raises DeviceLost, or Garbage for a frame that cannot be used.
         """
@@ -225,7 +225,7 @@ class Acquisition(Generic[Datum]):
         return found
 
     def answer(self, number: int) -> AcquiredFrame[Datum] | None:
-        """The frame that answers a request; None where there is none yet. Never waits."""
+        """Return the frame that answers a request; None where there is none yet. Never waits."""
         self.frames()
         return self._find(number)
 
@@ -233,7 +233,7 @@ class Acquisition(Generic[Datum]):
         return next((f for f in reversed(self._frames) if f.request == number), None)
 
     def wait_for_answer(self, number: int) -> AcquiredFrame[Datum] | None:
-        """The frame that answers a request, waited for until the device is at fault.
+        """Return the frame that answers a request, waited for until the device is at fault.
 
         Only where the Diagram may wait.
         """
@@ -270,7 +270,7 @@ class Acquisition(Generic[Datum]):
         return None
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of this device's acquisition."""
+        """Return the JSON object of this device's acquisition."""
         c, latency = self.counts, np.array(self._seen.latency)
         found: dict[str, object] = {
             "received": c.received,
@@ -396,7 +396,7 @@ class Acquisition(Generic[Datum]):
 
 
 def _print_of(datum: object) -> int:
-    """A number that two frames share only if they are identical."""
+    """Return a number that two frames share only if they are identical."""
     return zlib.crc32(np.ascontiguousarray(datum).data)
 
 

@@ -24,7 +24,7 @@ SUFFIXES = (".csv", ".npy")
 
 @dc.dataclass(kw_only=True)
 class FolderProfiler(WiredProfiler):
-    """`!FolderProfiler`: the folder, and how the program that writes into it is told to scan; see `!FolderScanner`.
+    """`!FolderProfiler`: the folder, and how the program that writes into it is triggered; see `!FolderScanner`.
 
     A file holds one profile: csv with the columns x and z, an empty cell where nothing was measured, or npy (n, 2).
     """
@@ -35,7 +35,7 @@ class FolderProfiler(WiredProfiler):
     remove_read: bool = False
 
     def source(self) -> FolderSource[Profile]:
-        """The folder as a source of profiles. Raises InputError for keys that cannot be used."""
+        """Return the folder as a source of profiles. Raises InputError for keys that cannot be used."""
 
         def read(path: Path) -> Profile:
             return checked_profile(read_profile(path), {"m": 1.0, "mm": 1e-3}[self.unit], self)

@@ -12,7 +12,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 
 @dc.dataclass(kw_only=True)
 class FolderScanner(WiredScanner):
-    """`!FolderScanner`: the folder, and how the program that writes into it is told to scan.
+    """`!FolderScanner`: the folder, and how the program that writes into it is triggered.
 
     Files are ply, pcd, npz, npy, xyz, pts or asc as `calibrate` reads them. Beside NAME.ply a file NAME.json, written
     before it, may hold `capture_time` (Unix time, s), `request` (the number of the trigger that it answers) and
@@ -27,7 +27,7 @@ class FolderScanner(WiredScanner):
     remove_read: bool = False  # delete files that were read
 
     def source(self) -> FolderSource[Cloud]:
-        """The folder as a source of clouds. Raises InputError for keys that cannot be used."""
+        """Return the folder as a source of clouds. Raises InputError for keys that cannot be used."""
         metres, far_m = self.metres, self.scanner().far_m
 
         def read(path: Path) -> Cloud:

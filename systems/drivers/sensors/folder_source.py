@@ -28,7 +28,7 @@ KEEP_ALIVE = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
 class Trigger:
-    """Tells another program to scan; this one does not: that program or an operator scans once the arm is at rest."""
+    """Trigger another program. This one does nothing: that program or an operator scans once the arm is at rest."""
 
     def open(self) -> None:
         """Connect. Raises DeviceLost."""
@@ -37,7 +37,7 @@ class Trigger:
         """Ask for scan number `request`. Raises DeviceLost."""
 
     def look(self) -> None:
-        """Read what the other program said. Raises DeviceLost where it is gone, DeviceFault where it refuses."""
+        """Read the other program's answer. Raises DeviceLost where it is gone, DeviceFault where it refuses."""
 
     def close(self) -> None:
         """Disconnect; a second call has no effect."""
@@ -130,7 +130,7 @@ class TcpTrigger(Trigger):
 
 
 def trigger_of(text: str) -> Trigger:
-    """The trigger of a scenario's word: empty, `file:PATH`, or `tcp://HOST:PORT`.
+    """Return the trigger of a scenario's word: empty, `file:PATH`, or `tcp://HOST:PORT`.
 
     Raises:
         InputError: it is none of these.
@@ -156,7 +156,7 @@ UNFINISHED = (".tmp", ".part", ".partial", ".crdownload")
 class NewFiles:
     """Files of some suffixes that appear in a folder, or change, after `start`.
 
-    A file is complete when its size and time of change have been the same for `settle_s`; one that was renamed into the
+    A file is complete when its size and time of change have been the same for `settle_s`. One that was renamed into the
     folder and last changed before that is complete at once, unless the computer's clock was set since `start`. Names
     that begin with a dot or end as unfinished downloads do are never looked at. The folder is polled: network folders
     do not report changes.
@@ -314,7 +314,7 @@ class FolderSource(Source[Datum]):
             raise DeviceLost(f"the folder '{self.folder}' cannot be read: {error.strerror}") from error
 
     def _read(self, path: Path) -> Delivery[Datum] | None:
-        """The datum of a settled file; None where it may still be incomplete.
+        """Return the datum of a settled file; None where it may still be incomplete.
 
         Raises Garbage where it cannot be used.
         """

@@ -90,7 +90,7 @@ class SourceProcess(Source[Datum]):
             raise self._ended() from None
 
     def _answer(self, timeout_s: float) -> Delivery[Datum] | None:
-        """The frame, or None for `opened`, that the process sent. Raises what the source raised there."""
+        """Return the frame, or None for `opened`, that the process sent. Raises what the source raised there."""
         assert self._pipe is not None
         try:
             if not self._pipe.poll(timeout_s):
@@ -124,7 +124,7 @@ def _stop(process: BaseProcess, pipe: Connection) -> None:
 
 
 def _serve(pipe: Connection, make: Callable[..., Source[Any]], arguments: tuple[Any, ...]) -> None:
-    """The process: follows the commands of the pipe until it is told to end, or nobody is at its other end."""
+    """Follow the commands of the pipe until the command to end, or until its other end is closed."""
     source, is_open = make(*arguments), False
     parent = os.getppid()
     with suppress(EOFError, OSError):

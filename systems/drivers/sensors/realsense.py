@@ -23,7 +23,7 @@ QUEUE = 4
 
 
 def _stereo(name: str, fov_deg: float, near: float, far: float, optimum: float, sigma: float) -> ScannerPreset:
-    """A stereo camera of 1280 x 720: view and range as in Intel's data sheet, typical noise."""
+    """Return a stereo camera of 1280 x 720: view and range as in Intel's data sheet, typical noise."""
     f = 640.0 / np.tan(np.deg2rad(0.5 * fov_deg))
     noise = DepthNoise(sigma_m=sigma, reference_m=optimum, edge_step_m=0.01, flying=0.5, edge_dropout=0.2)
     return ScannerPreset(
@@ -68,21 +68,21 @@ class RealSense(WiredScanner):
     options: dict[str, float] = dc.field(default_factory=dict)  # of the depth sensor, by librealsense's names
 
     def scanner(self) -> ScannerPreset:
-        """The preset with the configured resolution."""
+        """Return the preset with the configured resolution."""
         found = PRESETS.get(self.preset)
         if found is None:
             return super().scanner()
         return found if self.width is None else found.resized(self.width, self.height)
 
     def source(self) -> Source[Cloud]:
-        """The camera in a process of its own. Raises InputError where pyrealsense2 is not installed."""
+        """Return the camera in a process of its own. Raises InputError where pyrealsense2 is not installed."""
         require_realsense()
         self.scanner()
         return SourceProcess(title(self), RealSenseClouds, self)
 
 
 def title(config: RealSense) -> str:
-    """The camera's name at the beginning of a sentence."""
+    """Return the camera's name at the beginning of a sentence."""
     return f"The scanner RealSense {config.serial or config.preset}"
 
 
@@ -93,7 +93,7 @@ def require_realsense() -> None:
 
 
 def connected_devices() -> list[Any]:
-    """The cameras at this computer."""
+    """Return the cameras at this computer."""
     import pyrealsense2 as rs
 
     return list(rs.context().query_devices())
@@ -185,7 +185,7 @@ class RealSenseClouds(Source[Cloud]):
         return str(device.get_info(info)) if device.supports(info) else ""
 
     def _stream(self, sensor: Any) -> Any:
-        """The depth stream of the configured size and rate."""
+        """Return the depth stream of the configured size and rate."""
         c, sizes = self._config, []
         for profile in sensor.get_stream_profiles():
             video = profile.as_video_stream_profile()

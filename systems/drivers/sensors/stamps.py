@@ -36,7 +36,7 @@ class Stamp:
 
 
 def unix_now() -> float:
-    """The host's clock, Unix time in s."""
+    """Return the host's clock, Unix time in s."""
     return time.time()
 
 
@@ -65,7 +65,7 @@ class UnixClock:
         return min(found, unix_s + self._before, key=lambda t: abs(arrived - t))
 
     def _read(self) -> tuple[float, float]:
-        """The monotonic time and its distance from Unix time (s), of the quickest of some readings."""
+        """Return the monotonic time and its distance from Unix time (s), of the quickest of some readings."""
         readings = []
         for _ in range(READINGS):
             before, unix, after = self._monotonic(), self._unix(), self._monotonic()
@@ -160,7 +160,7 @@ class DeviceClock:
         return 0.0 if self._line is None else self._line.drift
 
     def stamp(self, device_s: float, arrived: float) -> Stamp:
-        """The stamp of a frame that the device captured at `device_s` of its own clock."""
+        """Return the stamp of a frame that the device captured at `device_s` of its own clock."""
         late = 0.0 if self._line is None else arrived - self._line.at(device_s)
         if self._line is not None and late > self._late_s:
             self._late_since = arrived if self._late_since is None else self._late_since
@@ -192,7 +192,7 @@ class DiagramTime:
         self._diagram.append(diagram_s)
 
     def at(self, host_s: float) -> float:
-        """The Diagram's time (s) at a host time.
+        """Return the Diagram's time (s) at a host time.
 
         Minus infinity before the first note, the newest note's after the last.
         """
@@ -264,6 +264,6 @@ class FollowedTime:
 
 
 def cell_time(build: StationBuild) -> CellTime:
-    """The clock of a station's devices."""
+    """Return the clock of a station's devices."""
     clock = None if build.robot is None else build.robot.clock
     return FollowedTime(clock.now) if clock is not None and clock.follows else HostTime()

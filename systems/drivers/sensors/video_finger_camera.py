@@ -95,7 +95,7 @@ class MjpegStream:
         self._boundary = b"--" + boundary.removeprefix("--").encode("latin-1")
 
     def next(self, timeout_s: float) -> StreamedPicture | None:
-        """The next whole part; None where none came in time.
+        """Return the next whole part; None where none came in time.
 
         Raises DeviceLost, and Garbage for a part that is no JPEG.
         """
@@ -129,7 +129,7 @@ class MjpegStream:
         return True
 
     def _part(self) -> StreamedPicture | None:
-        """The first whole part of what is unread."""
+        """Return the first whole part of what is unread."""
         start = self._unread.find(self._boundary)
         if start < 0:
             self._shorten()
@@ -191,7 +191,7 @@ class VideoFingerCamera(WiredFingerCamera):
     stamps: str = "none"
 
     def open_source(self) -> Source[Picture]:
-        """The source of pictures that `source` names. Raises InputError where it names none."""
+        """Return the source of pictures that `source` names. Raises InputError where it names none."""
         if not self.source:
             raise InputError(
                 "Write the camera's source in the scenario: finger_camera: !VideoFingerCamera {source:"

@@ -62,7 +62,7 @@ class WiredFingerCamera(FingerCameraConfig):
         return found
 
     def tag_size_m(self) -> float | None:
-        """The tag's measured side, m; None where there is no calibration of it."""
+        """Return the tag's measured side, m; None where there is no calibration of it."""
         found = self.calibrated()
         return None if found is None else found.tag_size_m
 
@@ -79,7 +79,7 @@ class WiredFingerCamera(FingerCameraConfig):
 
 
 def checked_picture(picture: NDArray[Any], width: int, height: int) -> Picture:
-    """The picture (H, W) in grey. Raises Garbage where it has another size."""
+    """Return the picture (H, W) in grey. Raises Garbage where it has another size."""
     if picture.ndim == 3:
         picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
     if picture.shape != (height, width):
@@ -136,7 +136,7 @@ class WiredPictures(LeafSystem):
 
 
 def acquire_pictures(config: WiredFingerCamera, source: Source[Picture]) -> Acquisition[Picture]:
-    """The acquisition of a camera's pictures, not started yet."""
+    """Return the acquisition of a camera's pictures, not started yet."""
     found = config.calibrated()
     prepare = None if found is None else found.rectifier()
     return Acquisition(source, config.rules(), kept=3, latency_s=config.latency_s, prepare=prepare)

@@ -49,7 +49,7 @@ def checked_profile(points: NDArray[Any], metres: float, config: RenderedProfile
 
 
 def acquire_profiles(config: WiredProfiler, source: Source[Profile]) -> Acquisition[Profile]:
-    """The acquisition of a profiler's profiles, not started yet."""
+    """Return the acquisition of a profiler's profiles, not started yet."""
     rules = Rules(late_s=float("inf"), answer_s=config.scan_timeout_s)
     return Acquisition(source, rules, kept=2, latency_s=config.latency_s)
 

@@ -49,7 +49,7 @@ class WiredScanner(ScannerConfig):
     late_s: float = 1.0  # that a frame of a stream comes late: a fault
 
     def scanner(self) -> ScannerPreset:
-        """The preset with the configured resolution and field of view."""
+        """Return the preset with the configured resolution and field of view."""
         preset = get_scanner(self.preset, width=self.width, height=self.height)
         if self.field_of_view_deg is None:
             return preset
@@ -57,7 +57,7 @@ class WiredScanner(ScannerConfig):
         return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
 
     def stream_delay_s(self) -> float | None:
-        """The latency, where the scanner runs freely."""
+        """Return the latency, where the scanner runs freely."""
         return self.latency_s if self.streams else None
 
     @property
@@ -98,8 +98,8 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     middle = float(np.median(z))
     if not 0.0 < middle <= FAR * far_m:
         raise Garbage(
-            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit"
-            " to the unit of its points, and let it send them in the frame of its camera"
+            f"the middle of the cloud is {middle:.3g} m away, but the scanner's range is {far_m:.3g} m: set scanner.unit"
+            " to the unit of its points, and send them in the camera frame"
         )
     return cloud
 
@@ -150,7 +150,7 @@ class WiredScanStream(LeafSystem):
         )
 
     def _arrival(self, host_s: float, now: float) -> float:
-        """The Diagram's time at a time of the host."""
+        """Return the Diagram's time at a time of the host."""
         if self._clock is None or not self._clock.follows:
             return self._times.at(host_s)
         return self._clock.diagram_time(self.acquisition.time.at(host_s), now)
@@ -160,7 +160,7 @@ class WiredScanStream(LeafSystem):
 
 
 def acquire(config: WiredScanner, source: Source[Cloud]) -> Acquisition[Cloud]:
-    """The acquisition of a scanner's clouds, not started yet."""
+    """Return the acquisition of a scanner's clouds, not started yet."""
     kept = SHOWN if config.streams else 2
     return Acquisition(source, config.rules(), kept=kept, latency_s=config.latency_s)
 

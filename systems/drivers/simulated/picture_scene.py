@@ -1,4 +1,4 @@
-"""A separate scene graph for a camera, and a stand that is knocked.
+"""Provide a separate scene graph for a camera, and a stand that is displaced.
 
 Its poses are updated only when a picture is taken.
 """

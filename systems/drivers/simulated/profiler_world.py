@@ -47,7 +47,7 @@ class ProfilerFixture(Message):
 
 
 def straightedge_mesh(length_m: float, width_m: float) -> TriMesh:
-    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, bevelled inwards."""
+    """Return a bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, bevelled inwards."""
     section = np.array([[0.0, 0.0], [width_m, 0.0], [width_m - BEVEL_M, -BEVEL_M], [BEVEL_M, -BEVEL_M]])
     ends = [np.column_stack([np.full(4, x), section]) for x in (-0.5 * length_m, 0.5 * length_m)]
     triangles = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]]
@@ -64,7 +64,7 @@ def post_mesh(top: Array, table_z_m: float) -> TriMesh:
 
 
 def under_straightedge(X_BE: RigidTransform, width_m: float) -> Array:
-    """The upper end of the straightedge's post: the middle of the straightedge's underside."""
+    """Return the upper end of the straightedge's post: the middle of the straightedge's underside."""
     return np.asarray(X_BE.multiply(np.array([0.0, 0.5 * width_m, -BEVEL_M])))
 
 

@@ -28,7 +28,7 @@ COVERED_GREY = 25  # of a lens under spatter
 
 
 class TagView:
-    """The tag of a tool in a pinhole camera. All that is seen is flat, so its picture is a homography of the print.
+    """Render the tag of a tool in a pinhole camera. The tag is flat, so its picture is a homography of the print.
 
     A renderer takes ten times as long for the same picture.
     """
@@ -113,7 +113,7 @@ def _noise_table(sigma: float) -> np.ndarray:
 
 
 def with_noise(grey: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    """A picture (H, W) uint8 with Gaussian noise of `sigma` grey levels on each pixel, as uint8."""
+    """Return a picture (H, W) uint8 with Gaussian noise of `sigma` grey levels on each pixel, as uint8."""
     drawn = np.frombuffer(rng.bytes(2 * grey.size), dtype=np.uint16).reshape(grey.shape)
     return np.asarray(cv2.add(grey, np.take(_noise_table(sigma), drawn), dtype=cv2.CV_8U), dtype=np.uint8)
 

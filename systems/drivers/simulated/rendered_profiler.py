@@ -69,7 +69,7 @@ class RenderedProfiler(DriverConfig):
         return float((z_m + self.apex_m) * (self.slopes[1] - self.slopes[0]))
 
     def preset(self) -> ProfilerPreset:
-        """The noise of samples as a ProfilerPreset; raises InputError for numbers that no profiler has."""
+        """Return the noise of samples as a ProfilerPreset; raises InputError for numbers that no profiler has."""
         if (
             not self.width_far_mm > self.width_near_mm > 0.0
             or min(self.noise_mm, self.jitter_mm, self.exposure_s) < 0.0
@@ -273,7 +273,7 @@ class CheatTorch(LeafSystem):
 
 
 def drawn_pose(config: RenderedProfiler) -> RigidTransform:
-    """The nominal X_FS."""
+    """Return the nominal X_FS."""
     return pose_of(config.xyz_m, config.rpy_deg)
 
 

@@ -64,7 +64,7 @@ class RenderedScanner(ScannerConfig):
     knock_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def knock(self, X_BC: RigidTransform) -> RigidTransform:
-        """The displacement in the base of a scanner at ``X_BC`` when its stand is knocked."""
+        """Return the displacement, in the base, of a scanner at ``X_BC`` whose stand is hit."""
         R = RotationMatrix(exp_rotation(np.deg2rad(self.knock_deg)))
         p = X_BC.translation()
         return RigidTransform(R, p + 1e-3 * np.array(self.knock_mm) - R @ p)
@@ -78,7 +78,7 @@ class RenderedScanner(ScannerConfig):
         return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
 
     def device(self, rng: np.random.Generator) -> ScannerPreset:
-        """The scanner with the errors of one device; ``rng`` draws its warp."""
+        """Return the scanner with the errors of one device; ``rng`` draws its warp."""
         preset = self.scanner()
         if len(self.gradient_error_per_m) != 2:
             raise InputError("scanner.gradient_error_per_m must be two numbers, along x and along y.")
@@ -97,7 +97,7 @@ class RenderedScanner(ScannerConfig):
 
 
 def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
-    """A pose error of exactly this magnitude (m, rad) in a random direction."""
+    """Return a pose error of exactly this magnitude (m, rad) in a random direction."""
     axis, direction = rng.normal(size=3), rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     direction /= np.linalg.norm(direction)
@@ -173,7 +173,7 @@ class DepthSensor(LeafSystem):
 
 
 def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:
-    """The body that carries the scanner; None: the scanner is fixed in the base."""
+    """Return the body that carries the scanner; None: the scanner is fixed in the base."""
     if mounted_on == "base":
         return None
     return world.plant.GetBodyByName(mounted_on if mounted_on == "flange" else f"{mounted_on}_link", world.arm)

@@ -40,7 +40,7 @@ class RenderedWristCamera(DriverConfig):
     depth_noise_mm: float = 0.8
 
     def nominal(self) -> RigidTransform:
-        """The nominal X_FC."""
+        """Return the nominal X_FC."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
     def camera_matrix(self) -> NDArray[np.float64]:

@@ -54,7 +54,7 @@ class StreamingScanner(RenderedScanner):
     device_clock: bool = True  # false: frames carry no stamp of the device
 
     def stream(self) -> ScannerStream:
-        """The timing of the stream. Raises InputError for times that no scanner has."""
+        """Return the timing of the stream. Raises InputError for times that no scanner has."""
         given = {
             "fps": self.fps,
             "delay_s": None if self.delay_ms is None else 1e-3 * self.delay_ms,
@@ -66,13 +66,13 @@ class StreamingScanner(RenderedScanner):
         return dc.replace(get_stream(self.preset), exposure_s=self.exposure_s, **known)
 
     def stream_delay_s(self) -> float | None:
-        """The mean delay of the stream."""
+        """Return the mean delay of the stream."""
         return self.stream().delay_s
 
 
 @dc.dataclass(frozen=True, eq=False)
 class _Streaming(Message):
-    """Instants of the frame that is being exposed, and the frames that are under way or have arrived."""
+    """Hold the instants of the frame that is being exposed, and the frames in transit or arrived."""
 
     count: int = 0
     instants: tuple[NDArray[np.float32], ...] = ()
@@ -86,7 +86,7 @@ def exposed_cloud(
     dark: NDArray[np.float32] | None,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """The organised cloud (H, W, 3) m of the depth pictures (H, W) of one exposure, with the scanner's noise."""
+    """Return the organised cloud (H, W, 3) m of the depth pictures (H, W) of one exposure, with the scanner's noise."""
     p, noise = preset, preset.noise
     depth = mixed_exposure(np.stack(list(instants)), noise.edge_step_m, noise.flying, rng)
     noisy = apply_noise(depth, p, rng, dark)
@@ -154,7 +154,7 @@ class DepthStream(LeafSystem):
         state.get_mutable_abstract_state(self._state).set_value(new)
 
     def _exposed(self, s: _Streaming, capture: float) -> _Streaming:
-        """The frame of the completed exposure joins those under way; no frame overtakes another one."""
+        """Add the frame of the completed exposure to those in transit; no frame overtakes another one."""
         rng = np.random.default_rng([self._seed, s.count])
         points = exposed_cloud(self._preset, s.instants, s.dark, rng)
         arrival = capture + self._timing.delay(rng)

@@ -118,7 +118,7 @@ class TabletDigitizer(LeafSystem):
 
 
 def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) -> GeometryId:
-    """The collision geometry of that name on a body."""
+    """Return the collision geometry of that name on a body."""
     inspector = build.require(SimulatedWorld).scene_graph.model_inspector()
     found = plant.GetCollisionGeometriesForBody(plant.world_body() if not body else plant.GetBodyByName(body))
     (geometry,) = (g for g in found if inspector.GetName(g).endswith(name))
@@ -183,7 +183,7 @@ def tablet_fittings(
 
 
 def page_picture(tablet: TabletConfig) -> NDArray[np.uint8]:
-    """The screen's picture (h, w), its first landmark `margin_mm` from the upper left corner."""
+    """Return the screen's picture (h, w), its first landmark `margin_mm` from the upper left corner."""
     size = 1e3 * tablet.landmarks_m().max(axis=0) + 2.0 * tablet.margin_mm
     w, h = (round(v * _TEXELS_PER_MM) for v in size)
     screen = np.full((h, w), 235, dtype=np.uint8)

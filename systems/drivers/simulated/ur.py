@@ -130,7 +130,7 @@ class SpeedJointServo(LeafSystem):
         discrete.set_value(self._sampled, [now])
 
     def _plant_steps_at(self, time: float) -> bool:
-        """Whether the plant makes a step at this tick."""
+        """Return whether the plant makes a step at this tick."""
         steps = time / self._plant_period_s
         return abs(steps - round(steps)) < 1e-6
 
@@ -193,7 +193,7 @@ def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
 
 
 def draw_true_arm(arm: ArmModel, error_mm: float, q: Array, rng: np.random.Generator) -> ArmModel:
-    """The arm with random errors in each link transform: three angles and three lengths, normal and independent.
+    """Return the arm with random errors in each link transform: three angles and three lengths, normal and independent.
 
     ``error_mm`` is the rms distance of the true flange from the reported one at ``q`` (6,) rad, over all draws. About a
     quarter of it remains between poses after the best rigid fit; the rest looks like a shift of the robot's base.

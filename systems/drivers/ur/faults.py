@@ -218,12 +218,12 @@ REPORTED = (
 
 
 def reported_as(name: str) -> float:
-    """The detail of a STATE_NOT_FINITE fault for this RTDE output."""
+    """Return the detail of a STATE_NOT_FINITE fault for this RTDE output."""
     return float(max(k for k, start in enumerate(REPORTED) if k == 0 or name.startswith(start)))
 
 
 def sentence(fault: Fault, detail: float = 0.0) -> str:
-    """The message of a fault, with the operator action."""
+    """Return the message of a fault, with the operator action."""
     lists = {Fault.PROCESS_OUTPUT: OUTPUT_REASONS, Fault.STATE_NOT_FINITE: dict(enumerate(REPORTED))}
     reasons = lists.get(fault, GUARD_REASONS)
     return SENTENCES[fault].format(detail=detail, reason=reasons.get(int(detail), "for an unknown reason"))

@@ -71,7 +71,7 @@ class LinkState(Published):
 
 @lru_cache(maxsize=64)
 def status_of(codes: tuple[float, ...]) -> UrStatus:
-    """The controller's state in words.
+    """Return the controller's state in words.
 
     The numbers are robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail.
     """
@@ -147,7 +147,7 @@ class UrLink:
         ended = f"It did not answer in {START_LIMIT_S:.0f} s." if code is None else f"It ended with exit code {code}."
         said = link._said()
         link._end()
-        raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" It said: {said}" if said else ""))
+        raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" Its output: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number.
@@ -174,13 +174,13 @@ class UrLink:
         return self._memory.ring.at(host_time)
 
     def robot_time(self) -> float:
-        """The controller's time (s) of the newest sample; 0 before the first. Never blocks."""
+        """Return the controller's time (s) of the newest sample; 0 before the first. Never blocks."""
         with contextlib.suppress(TornRead):
             self._last = self._memory.state.read() or self._last
         return 0.0 if self._last is None else self._last.robot_time
 
     def state(self) -> LinkState:
-        """The newest state. Never blocks.
+        """Return the newest state. Never blocks.
 
         Raises:
             RuntimeError: the worker is not active yet.

@@ -117,7 +117,7 @@ ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "ru
 
 
 def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[float]) -> bool:
-    """Whether the controller reports this payload, within what it may round: 0.01 kg and 1 mm."""
+    """Return whether the controller reports this payload, within what it may round: 0.01 kg and 1 mm."""
     if not {"payload", "payload_cog"} <= found.keys():
         return False
     mass, cog = np.array(found["payload"]), np.array(found["payload_cog"])
@@ -135,7 +135,7 @@ class Refused(Exception):
 def guard_script(
     upper_registers: bool, output: int | None = None, gas: int | None = None, levels: Sequence[Level] = ()
 ) -> str:
-    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share.
+    """Return the text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share.
 
     `output` and `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired;
     `levels`: set points.
@@ -156,7 +156,7 @@ def guard_script(
 
 
 def _without(text: str, mark: str) -> str:
-    """The script without the lines of a mark.
+    """Return the script without the lines of a mark.
 
     A controller may refuse a program for the name of a function that it never calls.
     """
@@ -299,7 +299,7 @@ class ControllerStream:
             return
 
     def sample(self, now: float) -> RobotSample:
-        """The newest sample, all fields of one package."""
+        """Return the newest sample, all fields of one package."""
         stream = self._stream
         stream.poll()
         robot_time = stream.number("timestamp")

@@ -25,11 +25,11 @@ class ArcInputs:
         return self.established is not None or self.arc_fault is not None
 
     def arc(self, bits: int) -> bool | None:
-        """Whether the arc is established; None where that is not wired."""
+        """Return whether the arc is established; None where that is not wired."""
         return None if self.established is None else bool(bits >> self.established & 1)
 
     def fault(self, bits: int) -> bool:
-        """Whether the power source reports a fault."""
+        """Return whether the power source reports a fault."""
         return self.arc_fault is not None and bool(bits >> self.arc_fault & 1)
 
 
@@ -77,7 +77,7 @@ class AnalogSetPoint:
     value: float = 0.0  # while the torch is asked for; the output is at 0 V or 4 mA otherwise
 
     def level(self, key: str) -> "Level":
-        """The output's level, for `key` of the scenario. Raises InputError where no output can show it."""
+        """Return the output's level, for `key` of the scenario. Raises InputError where no output can show it."""
         if self.output not in OUTPUTS:
             raise InputError(f"robot.{key}.output must be a standard analog output, 0 or 1, not {self.output}.")
         if self.unit not in (VOLT, MILLIAMPERE):
@@ -106,14 +106,14 @@ class Level:
     share: float
 
     def shown(self, value: float, domains: int) -> float:
-        """The share of the range that the controller reports (V or A); NaN where somebody changed the range."""
+        """Return the share of the range that the controller reports (V or A); NaN where somebody changed the range."""
         if bool(domains >> (DOMAINS + self.output) & 1) != self.volts:
             return math.nan
         return value / FULL_V if self.volts else (value - ZERO_A) / (FULL_A - ZERO_A)
 
 
 def levels_of(wire_feed: AnalogSetPoint | None, arc_voltage: AnalogSetPoint | None) -> tuple[Level, ...]:
-    """The levels of the set points that are wired.
+    """Return the levels of the set points that are wired.
 
     Raises InputError where one cannot be shown, or both are at one output.
     """
@@ -150,7 +150,7 @@ class SetPoints:
 
 
 def apart(asked: float, shown: float) -> bool:
-    """Whether an output shows something else than what it is asked for (shares of its range)."""
+    """Return whether an output shows something else than what it is asked for (shares of its range)."""
     return not abs(asked - shown) <= TOLERANCE  # also of NaN
 
 

@@ -57,7 +57,7 @@ class Block:
         self._writes[0] = self._count
 
     def read(self) -> tuple[float, ...] | None:
-        """All numbers of the newest write; None where nothing has been written yet.
+        """Return all numbers of the newest write; None where nothing has been written yet.
 
         Raises:
             TornRead: the writer changed the block during each attempt.
@@ -103,7 +103,7 @@ class Record(Generic[T]):
         self._block.write(values)
 
     def read(self) -> T | None:
-        """The newest record; None where nothing has been written yet.
+        """Return the newest record; None where nothing has been written yet.
 
         Raises:
             TornRead: the writer changed the block during each attempt.
@@ -131,7 +131,7 @@ def _parts(kind: type[Any]) -> Iterator[tuple[str, int, int | None, Callable[[fl
 
 
 def _numbers(kind: type[Any]) -> tuple[str, ...]:
-    """A name for each number of the block."""
+    """Return a name for each number of the block."""
     return tuple(
         name if count is None else f"{name}{i}" for name, _, count, _ in _parts(kind) for i in range(count or 1)
     )

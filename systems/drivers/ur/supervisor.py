@@ -99,12 +99,12 @@ class Limits:
         return bool(np.isfinite(self.hold_s))
 
     def slowed(self, pace: float) -> Limits:
-        """The same limits where the controller runs at `pace` seconds per host second."""
+        """Return the same limits where the controller runs at `pace` seconds per host second."""
         times: dict[str, Any] = {name: getattr(self, name) / pace for name in (*_SILENCES, "behind_for_s")}
         return replace(self, pace=pace, **times)
 
     def in_lockstep(self, patience_s: float = PATIENCE_S, held_s: float = HELD_S) -> Limits:
-        """The limits for an emulated controller in lockstep: the arm waits while this computer is late."""
+        """Return the limits for an emulated controller in lockstep: the arm waits while this computer is late."""
         times: dict[str, Any] = {name: max(getattr(self, name), patience_s) for name in (*_SILENCES, "jump_s")}
         return replace(self, hold_s=held_s / self.pace, **times)
 
@@ -294,7 +294,7 @@ class Supervisor:
         return Fault.NONE, 0.0
 
     def _set_points(self, robot: RobotSample) -> float | None:
-        """The share (%) that an analog output shows in place of what the guard gives it, of one package.
+        """Return the share (%) that an analog output shows in place of what the guard gives it, of one package.
 
         None: as it should.
         """
@@ -306,7 +306,7 @@ class Supervisor:
         return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
-        """Whether an arc is reported that nothing asks for.
+        """Return whether an arc is reported that nothing asks for.
 
         The input sticks or is noisy, or somebody else burns the torch.
         """

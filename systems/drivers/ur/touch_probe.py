@@ -63,7 +63,7 @@ class UrTouchProbe(DriverConfig):
             raise InputError(f"touch_probe.latency_s must be from 0 to 0.1, not {self.latency_s:g}.")
 
     def closed(self, bits: int) -> bool:
-        """Whether the input's level, one of the controller's `bits`, is that of a touch."""
+        """Return whether the input's level, one of the controller's `bits`, is that of a touch."""
         return bool(bits >> self.input & 1) != self.normally_closed
 
 

@@ -48,7 +48,7 @@ class TimeScale:
         self.factor = 1.0
 
     def step(self, now: float, age_s: float) -> float:
-        """The factor for a velocity that was given `age_s` (host time) before `now` (s, monotonic)."""
+        """Return the factor for a velocity that was given `age_s` (host time) before `now` (s, monotonic)."""
         age, passed = self._pace * age_s, self._pace * max(now - self._last, 0.0)
         fresh = min(max((ZERO_S - age) / (ZERO_S - FRESH_S), 0.0), 1.0)
         self.factor = min(fresh, self.factor + RISE_PER_S * passed)
@@ -152,7 +152,7 @@ class Worker:
         )
 
     def _with_torch(self, command: VelocityCommand, robot: ControllerStream, sample: RobotSample) -> VelocityCommand:
-        """The command whose torch waits for the gas and then for the set points, where they are wired."""
+        """Return the command whose torch waits for the gas and then for the set points, where they are wired."""
         torch, armed = command.process, False
         if self._config.gas_output is not None:
             flows, torch = self._gas.step(sample.robot_time, torch)
@@ -169,7 +169,7 @@ class Worker:
             self._gas_on = on
 
     def _scaled(self, command: VelocityCommand, now: float, sample: RobotSample) -> VelocityCommand:
-        """The command with the factor that slows the arm while command or state is late.
+        """Return the command with the factor that slows the arm while command or state is late.
 
         Not under a burning torch, which goes out first.
         """

@@ -100,7 +100,7 @@ class AddedMotion(AddedJob):
         return found
 
     def calibration(self, root: Context) -> MotionCalibration:
-        """The result, where it is there."""
+        """Return the result, where it is there."""
         if self.calibrator is None:
             return MotionCalibration()
         found: MotionCalibration = self.value(self.calibrator.GetOutputPort("calibration"), root)
@@ -276,7 +276,7 @@ def plan_corners(
 def facing(
     p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel, X_FR: RigidTransform | None = None
 ) -> RotationMatrix:
-    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m.
+    """Return the rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m.
 
     It is turned about its axis as near to that at home as can be.
     """

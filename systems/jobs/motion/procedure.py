@@ -52,7 +52,7 @@ class MotionRecord(Message):
     newest: tuple[Array, ...] = ()
 
     def stream(self, robot: str) -> RobotStream:
-        """The robot's stream, without poses: they follow from the joints."""
+        """Return the robot's stream, without poses: they follow from the joints."""
         rows = np.concatenate([*self.blocks, np.array(self.newest).reshape(-1, 7)])
         return RobotStream(rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1)), rows[:, 1:], robot)
 
@@ -198,7 +198,7 @@ class MotionCollector(LeafSystem):
 
 
 def _sampled(record: MotionRecord, row: np.ndarray) -> MotionRecord:
-    """The record with one more sample; a repeated time is left out."""
+    """Return the record with one more sample; a repeated time is left out."""
     last = record.newest[-1] if record.newest else (record.blocks[-1][-1] if record.blocks else None)
     if last is not None and row[0] <= last[0]:
         return record
@@ -209,7 +209,7 @@ def _sampled(record: MotionRecord, row: np.ndarray) -> MotionRecord:
 
 
 def _with_frame(record: MotionRecord, estimate: FlangeEstimate, now: float) -> MotionRecord:
-    """The record with one more frame."""
+    """Return the record with one more frame."""
     id = f"{estimate.sequence:05d}"
     record = replace(record, sequence=estimate.sequence, waits_s=(*record.waits_s, now - estimate.arrival_time))
     if estimate.fit is None:
@@ -257,7 +257,7 @@ def calibrate_record(record: MotionRecord, arm: ArmModel) -> MotionCalibration:
 
 
 def posed_stream(record: MotionRecord, arm: ArmModel) -> RobotStream:
-    """The robot's stream as flange poses by its own kinematics."""
+    """Return the robot's stream as flange poses by its own kinematics."""
     stream = record.stream(arm.name)
     assert stream.joints is not None
     poses = np.array([forward_kinematics(arm, q).GetAsMatrix4() for q in stream.joints])

@@ -32,7 +32,7 @@ class SecondArm:
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
 
     def pose(self) -> RigidTransform:
-        """The nominal X_BD."""
+        """Return the nominal X_BD."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
 

@@ -155,7 +155,7 @@ def digest(
 def next_best(
     belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """The unvisited planned pose that reduces the expected error at the work point most.
+    """Return the unvisited planned pose that reduces the expected error at the work point most.
 
     All are reachable, visible and clear; None where all were visited.
     """
@@ -190,7 +190,7 @@ class AddedMounting(AddedJob):
     truth: dict[str, RigidTransform]
 
     def status(self, root: Context) -> MountingStatus:
-        """The present result of the calibration."""
+        """Return the present result of the calibration."""
         status: MountingStatus = self.value(self.calibrator.GetOutputPort("status"), root)
         return status
 
@@ -275,7 +275,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
 
 
 def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """The scene as known before the first scan, from drawings and rough measurements.
+    """Return the scene as known before the first scan, from drawings and rough measurements.
 
     And the dimensions of the circle.
     """
@@ -323,7 +323,7 @@ def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[
 
 
 def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransform]:
-    """The true values of the unknowns; in simulation the circle is exactly at its nominal pose."""
+    """Return the true values of the unknowns; in simulation the circle is exactly at its nominal pose."""
     found = {} if station.truth.X_LC is None else {"X": station.truth.X_LC}
     if station.truth.X_BD is not None:
         found["Y"] = station.truth.X_BD

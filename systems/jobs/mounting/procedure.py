@@ -54,7 +54,7 @@ class NextBest:
     sigma_after_m: float
 
     def sentence(self) -> str:
-        """The proposal as one sentence for the operator."""
+        """Return the proposal as one sentence for the operator."""
         joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.q))
         second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
         p = 1e3 * self.X_BF.translation()

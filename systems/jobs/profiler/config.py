@@ -103,12 +103,12 @@ class ProfilerJob:
 
 
 def pose_of(xyz_m: list[float], rpy_deg: list[float]) -> RigidTransform:
-    """The pose of a scenario's position (m) and roll-pitch-yaw (deg)."""
+    """Return the pose of a scenario's position (m) and roll-pitch-yaw (deg)."""
     return RigidTransform(RollPitchYaw(np.deg2rad(rpy_deg)), xyz_m)
 
 
 def edge_as_thought(job: ProfilerJob) -> tuple[Array, Array]:
-    """The nominal edge: a point (3,) m of the straightedge's edge and its direction (3,), in B."""
+    """Return the nominal edge: a point (3,) m of the straightedge's edge and its direction (3,), in B."""
     X = pose_of(job.straightedge.xyz_m, job.straightedge.rpy_deg)
     return np.array(X.translation()), X.rotation().matrix()[:, 0].copy()
 

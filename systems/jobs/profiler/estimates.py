@@ -142,7 +142,7 @@ def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:
 
 
 def _one_background(points: Array, behind_m: float) -> Array:
-    """The profile with all samples far behind its nearest face at one depth: post and table have no edges."""
+    """Return the profile with all samples far behind its nearest face at one depth: post and table have no edges."""
     p = points[np.isfinite(points).all(axis=1)]
     if not len(p):
         return p
@@ -269,12 +269,12 @@ def find_seam(
 
 
 def _means(p: Array, place: NDArray[np.int_]) -> Array:
-    """The mean point (m, 3) of each place, in the order of the places."""
+    """Return the mean point (m, 3) of each place, in the order of the places."""
     return np.array([p[place == k].mean(axis=0) for k in np.unique(place)])
 
 
 def pose_sigmas(error: RigidTransform, covariance: Array) -> tuple[Array, float]:
-    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction.
+    """Return an error exp(w), t (estimate to truth, in F) in sigmas of the prediction.
 
     Each of its six parts, and w^T C^-1 w of all.
     """

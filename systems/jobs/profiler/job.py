@@ -122,7 +122,7 @@ class Profiler(Job[PlanningContext]):
         job = scenario.part(ProfilerJob)
         if job is not None and "sphere" in job.stages and not station.diagram.HasOutputPort("torch.touch"):
             raise InputError(
-                "Nothing tells when the torch touches the sphere in this cell: add touch_probe: !UrTouchProbe {host:"
+                "This cell cannot detect when the torch touches the sphere: add touch_probe: !UrTouchProbe {host:"
                 " ..., input: ...}, or write profiler_job: {stages: [edge]}."
             )
         return planning_context(scenario, station)
@@ -151,7 +151,7 @@ class Profiler(Job[PlanningContext]):
 
 
 def planning_context(scenario: Scenario, station: Station) -> PlanningContext:
-    """The nominal data with which the procedure starts, from drawings only."""
+    """Return the nominal data with which the procedure starts, from drawings only."""
     job, profiler, spec = scenario.part(ProfilerJob), scenario.profiler, scenario.workpiece
     if job is None or not isinstance(profiler, RenderedProfiler):
         raise InputError("This scenario has no profiler: write profiler: !RenderedProfiler {} and profiler_job: {}.")

@@ -68,7 +68,7 @@ class PlanningContext:
         return Field(1e-3 * self.job.half_width_mm, 1e-3 * self.job.near_mm, 1e-3 * self.job.far_mm)
 
     def bodies(self) -> list[LinkCapsule]:
-        """The arm with the rig on its flange."""
+        """Return the arm with the rig on its flange."""
         at = np.array(self.X_FS.translation())
         capsules = [
             Capsule(len(LINKS), np.zeros(3), np.array(self.p_FTip), 0.008),
@@ -94,7 +94,7 @@ class PlanningContext:
         return float((np.min(gaps, axis=0) - radii).min())
 
     def clear_way(self, q_a: Array, q_b: Array) -> bool:
-        """Whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
+        """Return whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
         if not self._keeps_gap(q_a, q_b, 0.5e-3 * self.job.clearance_mm):
             return False
         if self.surroundings.touched_on_path(self.arm, self.bodies(), q_a, q_b):
@@ -103,7 +103,7 @@ class PlanningContext:
         return lowest > self.table_z_m and gap > 0.0
 
     def _keeps_gap(self, q_a: Array, q_b: Array, least_m: float) -> bool:
-        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space.
+        """Return whether torch and profiler keep `least_m` (m) on a straight move in joint space.
 
         From each checked configuration on by no more than what they have left there.
         """
@@ -212,7 +212,7 @@ class JointPath(Message):
         return CubicSpline(self.s, self.q)
 
     def backwards(self) -> JointPath:
-        """The reversed path."""
+        """Return the reversed path."""
         return JointPath(self.s[-1] - self.s[::-1], self.q[::-1].copy(), self.speed)
 
 
@@ -408,7 +408,7 @@ def _stretch(planning: PlanningContext, s: Array) -> NDArray[np.bool_]:
 def _along(
     planning: PlanningContext, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str
 ) -> list[Goal]:
-    """A goal above the start, then the path."""
+    """Return a goal above the start, then the path."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))

@@ -262,7 +262,7 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         return self._go_on(s, now) if s.seen == s.trigger else s
 
     def _collected(self, s: ProfilerState, now: ProfilerInputs) -> ProfilerState:
-        """The state with the newest profile added, as soon as the joints at its capture time are known."""
+        """Return the state with the newest profile added, as soon as the joints at its capture time are known."""
         scan = now.profile
         q = now.history.joints_at(scan.capture_time) if scan.sequence > s.seen else None
         if q is None:

@@ -52,7 +52,7 @@ class TabletConfig:
     tilt_deg: float = 12.0  # tilt of the pen, in varying directions; 0: an upright pen
 
     def pose(self) -> RigidTransform:
-        """The nominal X_BT."""
+        """Return the nominal X_BT."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
     def landmarks_m(self) -> Array:

@@ -35,7 +35,7 @@ _LEAN_STEP_RAD = 2.4
 
 
 def tablet_of(scenario: Scenario) -> TabletConfig:
-    """The nominal tablet; raises InputError where there is none."""
+    """Return the nominal tablet; raises InputError where there is none."""
     tablet = scenario.part(TabletConfig)
     if tablet is None:
         raise InputError("This scenario has no tablet: write tablet: {} and tool: pen in it, or run scenario 'tablet'.")
@@ -43,14 +43,14 @@ def tablet_of(scenario: Scenario) -> TabletConfig:
 
 
 def camera_of(scenario: Scenario) -> RenderedWristCamera:
-    """The nominal wrist camera; raises InputError where there is none."""
+    """Return the nominal wrist camera; raises InputError where there is none."""
     if not isinstance(scenario.wrist_camera, RenderedWristCamera):
         raise InputError("The tablet job needs a camera: write wrist_camera: !RenderedWristCamera {} in the scenario.")
     return scenario.wrist_camera
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included.
+    """Return the joints (6,) of a flange pose nearest to `q_near`, whole turns included.
 
     Raises InputError where out of reach.
     """
@@ -140,7 +140,7 @@ class AddedVisit(AddedJob):
         return self.known
 
     def picture(self, root: Context) -> WristPicture:
-        """The camera's newest picture."""
+        """Return the camera's newest picture."""
         diagram = self.station.diagram
         shown: WristPicture = diagram.GetOutputPort("wrist_camera.picture").Eval(diagram.GetMyContextFromRoot(root))
         return shown

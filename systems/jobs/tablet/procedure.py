@@ -81,8 +81,8 @@ class TabletProcedure(Procedure[TabletState, TabletInputs]):
         - trigger
         - descent
 
-    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends;
-    `descent` (6) rad/s moves the pen straight down, zero otherwise; `hold` (1) is the operator's stop request.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends.
+    `descent` (6) rad/s moves the pen straight down, zero otherwise. `hold` (1) is the operator's stop request.
     """
 
     inputs = TabletInputs

@@ -45,7 +45,7 @@ class AddedTouches(AddedJob):
         return phase_words(state.phase, at), 0.95 if state.finished else 0.1 + 0.8 * len(state.felt) / self.points
 
     def touches(self, root: Context) -> tuple[Touch, ...]:
-        """The touches so far: where the tip was pressed to, its ball less what it gave way, and the scan's plane."""
+        """Return the touches so far: pressed position of the tip, its ball less its deflection, the scan's plane."""
         return tuple(self._touch(f"touch{k + 1:02d}", felt) for k, felt in enumerate(self.state(root).felt))
 
     def height_m(self, felt: Felt) -> float:

@@ -1,4 +1,4 @@
-"""TouchProcedure: scans the part, then lowers the soft tip onto each place until the finger camera sees it give way."""
+"""Scan the part, then lower the soft tip onto each place until the finger camera measures its deflection."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -94,9 +94,9 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         - descent
         - streaming
 
-    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends;
-    `descent` (6) rad/s moves the tip against the face's normal, zero otherwise; `trigger` (1) and `streaming` (1) go to
-    the station; `hold` (1) is the operator's stop request.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends.
+    `descent` (6) rad/s moves the tip against the face's normal, zero otherwise. `trigger` (1) and `streaming` (1) go to
+    the station. `hold` (1) is the operator's stop request.
     """
 
     inputs = TouchInputs
@@ -192,7 +192,7 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         return self.go(s, now, "go_home", self._motion.q_home)
 
     def _framed(self, s: TouchState, now: TouchInputs) -> TouchState:
-        """The state with a new valid frame of the finger camera."""
+        """Return the state with a new valid frame of the finger camera."""
         sequence, sample = now.deformation.sequence, now.deformation.sample
         if sequence <= s.seen or sample is None or not sample.valid:
             return s

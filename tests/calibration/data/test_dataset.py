@@ -117,12 +117,7 @@ def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
         ("poses.csv", "0.5,0.2,0.4", "0.5,1e308,0.4", "beyond 1e\\+09"),
         ("dataset.yaml", "clouds: m,", "clouds: inch,", "unit 'inch' for clouds; write m or mm"),
         ("dataset.yaml", "eye_on_base", "eye_in_foot", "configuration 'eye_in_foot'"),
-        (
-            "dataset.yaml",
-            "eye_on_base",
-            "eye_in_hand",
-            "an arm carries \\(eye_in_hand\\); only 'weldcal calibrate' reads it",
-        ),
+        ("dataset.yaml", "eye_on_base", "eye_in_hand", "on an arm \\(eye_in_hand\\)"),
         ("dataset.yaml", "robot: ur10e", "robots: ur10e", "has no key 'robots'; did you mean 'robot'"),
         ("poses.csv", "0.5,0.2,0.4", "0.5,,0.4", "'' in column y of 'b'; a number is needed"),
         ("poses.csv", "0.5,0.2,0.4", "0.5,nan,0.4", "nan in column y of 'b'"),
@@ -187,7 +182,7 @@ def test_pairs_are_read_and_mixed_units_are_noticed(tmp_path: Path) -> None:
     assert len(data.pairs) == 5
     assert not data.pairs[0].has_orientation
     change(tmp_path / "dataset.yaml", "clouds: m,", "clouds: mm,")
-    with pytest.raises(DatasetError, match="one of them is in millimetres"):
+    with pytest.raises(DatasetError, match="One of the two is in millimetres"):
         load_dataset(tmp_path)
 
 

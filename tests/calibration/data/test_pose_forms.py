@@ -182,7 +182,7 @@ def test_every_form_gives_the_same_flange_poses_and_says_how_it_was_read(scans: 
 HALF = X.copy()
 HALF[:, :3, :3] *= 1.1
 SENTENCES = {
-    "fewer poses than clouds": ("poses.txt", rows(P[:-1], TURN.as_rotvec()[:-1]), "holds 4 poses, and there are 5 clouds"),
+    "fewer poses than clouds": ("poses.txt", rows(P[:-1], TURN.as_rotvec()[:-1]), "has 4 poses, but there are 5 clouds"),
     "no rotations": ("poses.csv", rows(HALF.reshape(N, 16)), "are no rigid pose"),
     "5 numbers": ("poses.txt", rows(P, P[:, :2]), "which is no list of poses"),
     "other names": ("poses.csv", "name,x,y,z,rx,ry,rz\n" + "".join(f"view{k + 20},0.5,0,0.5,0,0,{k}\n" for k in range(N)), "names do not go together"),
@@ -241,7 +241,7 @@ def test_captures_in_a_closed_format_are_to_be_exported(tmp_path: Path) -> None:
     for k in range(3):
         (tmp_path / f"img{k:02d}.zdf").write_bytes(b"closed")
         opencv(tmp_path / f"pos{k:02d}.yaml", {"PoseState": X[k]})
-    with pytest.raises(DatasetError, match=r"\.zdf files .* export each as \.ply or \.pcd"):
+    with pytest.raises(DatasetError, match=r"\.zdf files .* Export each as \.ply or \.pcd"):
         load_dataset(tmp_path)
 
 
@@ -263,7 +263,7 @@ def test_joint_angles_do_not_stand_for_a_missing_column(scans: Path, missing: st
 def test_scans_of_a_carried_scanner_are_sent_to_calibrate(scans: Path, configuration: str) -> None:
     np.save(scans / "poses.npy", X)
     (scans / "dataset.yaml").write_text(f"schema: 1\nconfiguration: {configuration}\n")
-    with pytest.raises(DatasetError, match="only 'weldcal calibrate' reads it"):
+    with pytest.raises(DatasetError, match="Give the folder to 'weldcal calibrate'"):
         load_dataset(scans)
 
 

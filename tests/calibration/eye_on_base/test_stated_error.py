@@ -211,10 +211,13 @@ def test_the_terminal_prints_the_verdict_and_the_pose(tmp_path: Path) -> None:
     found = load_result(result).X_BC
     x, y, z = 1e3 * found.translation()
     for run in (made, judged):
-        text = " ".join(run.stdout.split())
-        assert f"position {x:+.3f} {y:+.3f} {z:+.3f} mm" in text
-        assert f"UR pose {export_ur_pose(found).strip()}" in text
-    assert "verdict use it" in " ".join(judged.stdout.split())
+        assert f"X_BC {x:.3f}, {y:.3f}, {z:.3f} mm; rotation vector" in " ".join(run.stdout.split())
+    assert judged.stdout.startswith("verify: use it")
+    every = CliRunner().invoke(app, ["verify", str(result), str(new), "--out", str(tmp_path / "all"), "-v"])
+    text = " ".join(every.stdout.split())
+    assert f"position {x:+.3f} {y:+.3f} {z:+.3f} mm" in text
+    assert f"UR pose {export_ur_pose(found).strip()}" in text
+    assert "verdict use it" in text
     live = pose_rows(found.GetAsMatrix4().tolist())
     assert live["UR pose"] == export_ur_pose(found).strip()
 

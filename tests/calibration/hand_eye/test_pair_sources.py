@@ -59,7 +59,7 @@ def test_two_robots_in_two_units_are_named(tmp_path: Path, factors: tuple[float,
         read_pairs(path, mounting="co_manipulation")
 
 
-@pytest.mark.parametrize(("factor", "words"), [(0.037, "in another unit, or of unknown scale"), (0.6, "squares")])
+@pytest.mark.parametrize(("factor", "words"), [(0.037, "another unit, or an unknown scale"), (0.6, "squares")])
 def test_only_a_small_factor_is_a_wrong_board(tmp_path: Path, factor: float, words: str) -> None:
     path = tmp_path / "pairs.npz"
     np.savez(path, A=A, B=scaled(B, factor))

@@ -129,7 +129,7 @@ def test_scans_without_the_sphere_are_left_out_and_inverse_poses_are_refused(tmp
     assert code == 1
     assert "transposed" in text
     np.savez(tmp_path / "r.npz", T=T, profiles=np.array(d.profiles), radius=d.radius_m + 0.001, unit="m")
-    _, text = called("sphere", tmp_path / "r.npz", "--model", "rigid", "--out", tmp_path / "c")
+    _, text = called("sphere", tmp_path / "r.npz", "--model", "rigid", "--out", tmp_path / "c", "-v")
     assert "heck the radius" in text
 
 
@@ -253,4 +253,4 @@ def test_a_noisier_sensor_is_no_outlier_and_an_outlier_is_named(tmp_path: Path) 
         assert record.covariance is not None
         error = record.translation - STATE.translation
         assert (np.abs(error) < 4.0 * np.sqrt(np.diag(record.covariance))[3:]).all()
-    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "printed")[1]
+    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "printed", "-v")[1]

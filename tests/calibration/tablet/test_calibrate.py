@@ -275,7 +275,7 @@ def test_what_looks_wrong_with_full_poses_is_told(visit: Path, tmp_path: Path, c
             ),
             "counts its landmarks from 1",
         ),
-        (lambda f: write(f / "touches.csv", [{**r, "landmark": 2 * int(r["landmark"]) % 9} for r in rows_of(f / "touches.csv")]), "make no grid"),
+        (lambda f: write(f / "touches.csv", [{**r, "landmark": 2 * int(r["landmark"]) % 9} for r in rows_of(f / "touches.csv")]), "not a grid"),
         (lambda f: (f / "touches.csv").write_text((f / "touches.csv").read_text().splitlines()[0]), "holds no touch"),
         (lambda f: (f / "camera.yaml").write_text("K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\nD: [1, 2, 3]\n"), "OpenCV knows 4, 5"),
     ],

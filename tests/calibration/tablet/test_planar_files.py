@@ -171,7 +171,7 @@ def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fi
         (lambda d: {**d, "f": np.zeros(2)}, "f must be a positive number of pixels"),
         (lambda d: {key: value for key, value in d.items() if key != "hand_q"}, "but lacks hand_q"),
         (lambda d: {**d, "uv": np.zeros((0, 9, 2))}, "holds no visit"),
-        (lambda d: {**d, "uv": np.zeros((3, 9, 2))}, "No pose of the tablet explains"),
+        (lambda d: {**d, "uv": np.zeros((3, 9, 2))}, "No pose of the tablet fits"),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_one_sentence(

@@ -89,7 +89,7 @@ def test_a_wall_that_ends_at_the_ball_carries_less() -> None:
     ("section", "says"),
     [
         (JointSection(math.pi / 2, 0.01, 0.01, 0.0036), "falls through"),
-        (JointSection(math.pi / 2, 0.0002, 0.0002, 0.003), "stands on the ground"),
+        (JointSection(math.pi / 2, 0.0002, 0.0002, 0.003), "touches the ground"),
         (JointSection(math.pi / 2, 0.01, 0.01, 0.0), "without a gap"),
         (JointSection(math.pi / 2, 0.01, 0.01, 0.001), "too narrow to be felt"),
         (JointSection(math.radians(78.0), 0.02, 0.02), "too flat"),

@@ -64,7 +64,7 @@ def test_a_flange_without_holes_has_none_to_fill() -> None:
 
 @pytest.mark.parametrize("name", ["tablet", "eye_in_hand"])
 def test_a_scenario_without_a_scanner_in_the_base_is_refused(name: str) -> None:
-    with pytest.raises(InputError, match="needs a simulated arm and a scanner that stands in the base"):
+    with pytest.raises(InputError, match="needs a simulated arm and a scanner that is fixed in the base"):
         study_light_runs(load_scenario(name), 10)
 
 

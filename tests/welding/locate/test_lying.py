@@ -11,7 +11,8 @@ from tests.welding.locate.lying import tube_on_plate as with_tube
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.welding.locate.part.registration import register_part
-from weldcal.welding.locate.part.scan import finite_points, prepare
+from weldcal.welding.locate.part.scan import prepare
+from weldcal.welding.locate.planes import finite_points
 
 KINDS = {f.__name__: k for k, f in enumerate([*SCENES, *REFUSED])}
 

@@ -18,7 +18,8 @@ from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound
 from weldcal.welding.locate.part.rivals import same_set
-from weldcal.welding.locate.part.scan import finite_points, prepare
+from weldcal.welding.locate.part.scan import prepare
+from weldcal.welding.locate.planes import finite_points
 
 SCANNER = get_scanner("phoxi_m", 412)
 QUICK = PartConfig(turn_step_rad=math.radians(12.0), cell_m=0.006)

@@ -109,7 +109,7 @@ class Sheet:
         self.texts.append((x, MARGIN_MM - 1.5, 3.0, words))
 
     def pdf(self) -> bytes:
-        """The page as a PDF file of version 1.4, uncompressed."""
+        """Return the page as a PDF file of version 1.4, uncompressed."""
         draw = [f"{POINTS_PER_MM:.9f} 0 0 {POINTS_PER_MM:.9f} 0 0 cm"]
         for colour, rectangles in ((0, self.black), (1, self.white)):
             draw.append(f"{colour} g")
@@ -175,13 +175,13 @@ class CharucoBoard:
             raise InputError(f"The dictionary {self.dictionary} has {most} markers: take fewer squares or another one.")
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        """The board in m, for OpenCV."""
+        """Return the board in m, for OpenCV."""
         sides = (1e-3 * self.square_mm, 1e-3 * self.marker_mm)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), *sides, dictionary_named(self.dictionary))
 
 
 def board_sheet(board: CharucoBoard, paper: str) -> Sheet:
-    """The board in the middle of a page. Raises InputError where it does not fit."""
+    """Return the board in the middle of a page. Raises InputError where it does not fit."""
     sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
     return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
 
@@ -288,8 +288,8 @@ def _require_space(sheet: Sheet, width: float, height: float, paper: str) -> Non
     room = (sheet.width - 2.0 * MARGIN_MM, sheet.height - 2.0 * MARGIN_MM - FOOT_MM)
     if width > room[0] or height > room[1]:
         raise InputError(
-            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, which has room for {room[0]:.0f} x {room[1]:.0f} mm:"
-            " take a larger --paper, or less."
+            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, whose printable area is {room[0]:.0f} x"
+            f" {room[1]:.0f} mm. Take a larger --paper, or fewer or smaller squares."
         )
 
 

@@ -86,7 +86,7 @@ class CellReport:
         return next((check.operator_action for _, check in self.rows if check.checked and not check.ok), "")
 
     def summary(self) -> Mapping[str, object]:
-        """The JSON object of the command."""
+        """Return the JSON object of the command."""
         return {
             "state": "ready" if self.ok else "refused",
             "reason": self.first_problem,
@@ -131,7 +131,7 @@ def look_at_cell(
 
 
 def _stands_at(scenario: Scenario, seed: int) -> Array:
-    """Where a simulated arm stands (6,) rad: at the best calibration pose before a simulated scanner, else at home."""
+    """Return joints (6,) rad of a simulated arm: at the best calibration pose of a simulated scanner, else at home."""
     home: Array = np.deg2rad(scenario.home_deg)
     simulated = scenario.robot.SIMULATED and scenario.scanner.SIMULATED
     if not simulated or not scenario.job.calibrate or scenario.calibration.configuration != "eye_on_base":
@@ -146,14 +146,14 @@ def _stands_at(scenario: Scenario, seed: int) -> Array:
 
 
 def _alone(scenario: Scenario, device: str) -> Scenario:
-    """The scenario with this sensor and a simulated arm only."""
+    """Return the scenario with this sensor and a simulated arm only."""
     left_out: dict[str, Any] = {name: NoDevice() for name in LOOKED_AT if name != device}
     robot = scenario.robot if scenario.robot.SIMULATED else SimulatedUr()
     return dc.replace(scenario, robot=robot, **left_out)
 
 
 def _robot(scenario: Scenario, q: Array) -> tuple[list[tuple[str, Check]], RigidTransform | None]:
-    """The robot's checks, and the pose of its flange where it could be read."""
+    """Return the robot's checks, and the pose of its flange where it could be read."""
     config = scenario.robot
     arm = nominal_arm(scenario)
     if isinstance(config, UrRtde):
@@ -244,7 +244,7 @@ def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) ->
 
 
 def _tag(scenario: Scenario, config: FingerCameraConfig, picture: Array) -> Check:
-    """Whether the tag is in a picture, and how sharp its edges are."""
+    """Return whether the tag is in a picture, and how sharp its edges are."""
     loaded = scenario.loaded_tool()
     tool = (load_tool(WELDING) if loaded is None else loaded).tool
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
@@ -273,7 +273,7 @@ def edge_width_px(picture: NDArray[np.uint8], corners: Array) -> float:
 
 
 def _torch(scenario: Scenario) -> list[tuple[str, Check]]:
-    """Whether the torch's output is off."""
+    """Return whether the torch's output is off."""
     config = scenario.robot
     if not isinstance(config, UrRtde) or config.process_output is None:
         return []

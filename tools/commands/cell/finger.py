@@ -138,7 +138,7 @@ class FingerReport:
         return FirstScreen(found, expected, after, (), more)
 
     def document(self) -> dict[str, Any]:
-        """The contents of finger.yaml, and the JSON object of the command."""
+        """Return the contents of finger.yaml, and the JSON object of the command."""
         K, c = self.camera.K, self.camera
         found: dict[str, Any] = {
             "schema": SCHEMA,
@@ -213,7 +213,7 @@ def calibrate_finger(
 
 
 def finger_page(report: FingerReport, folder: Path) -> str:
-    """The report as one self-contained HTML text."""
+    """Return the report as one self-contained HTML text."""
     c, t = report.camera, report.tip
     rows = [
         ("reprojection, rms, of the pictures used", f"{c.rms_px:.3f} px"),
@@ -259,7 +259,7 @@ def _same_size(size: tuple[int, int] | None, picture: NDArray[np.uint8], name: P
 
 
 def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool: WeldingTool) -> FingerReport:
-    """The report with what the touches show."""
+    """Return the report with what the touches show."""
     header, rows = read_rows(table)
     if not {"picture", *COLUMNS} <= set(header):
         raise InputError(
@@ -276,7 +276,7 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
         _same_size(size, picture, name)
         found = detect_tag(picture, camera.K, tag, distortion=camera.distortion)
         if not found.valid or found.X_KM is None:
-            raise InputError(f"'{table.name}', line {line}: the tag is not seen in {row['picture']}: {found.reason}")
+            raise InputError(f"'{table.name}', line {line}: no tag was found in {row['picture']}: {found.reason}")
         if not any(row[key] for key in COLUMNS):
             rest = found
             continue

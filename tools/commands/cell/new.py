@@ -161,7 +161,7 @@ def new(
 
 
 def edge_numbers(text: str) -> list[int]:
-    """The numbers of a list such as 12,13. Raises InputError."""
+    """Return the numbers of a list such as 12,13. Raises InputError."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not all(word.isdecimal() for word in words):
         raise InputError(f"--edges must be numbers with commas between them, such as 12,13, not '{text}'.")
@@ -322,7 +322,7 @@ def _below(config: Any, indent: str) -> Iterator[str]:
 
 
 def _line(key: SchemaKey, value: Any, indent: str, written: bool = False) -> str:
-    """The key with its value, behind a comment sign where that is the default, and what it means."""
+    """Return the key with its value, behind a comment sign where that is the default, and what it means."""
     meaning = key.meaning
     mark = "# " if value == key.default and not written and key.name != "description" else ""
     text = f"{indent}{mark}{key.name}: {yaml_of(value)}"
@@ -378,7 +378,7 @@ def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: 
 
 
 def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
-    """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
+    """Return the first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
     There it must also be found in a scan: else the reason is why not. Where there is none: the scenario's own pose, and
     the reason of the try in which the most seams could be welded; `advises`: with what would help.
@@ -458,7 +458,7 @@ def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseCon
 
 
 def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
-    """The pose of a part that stands on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
+    """Return the pose of a part on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
     R = RotationMatrix.MakeZRotation(np.deg2rad(turn_deg)).matrix()
     x, y = np.array(PLACE_M) - (R @ middle_P)[:2]
     z = scenario.calibration.table_z_m - float(mesh.bounds[0, 2])

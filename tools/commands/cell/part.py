@@ -83,7 +83,7 @@ def with_plans(
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:
-    """The edges that an operator may pick, the concave ones first; tangent edges are no joint."""
+    """Return the edges that an operator may pick, the concave ones first; tangent edges are no joint."""
     order = {"concave": 0, "flush": 1, "boundary": 2, "convex": 3}
     return sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], e.id))
 
@@ -102,7 +102,7 @@ def as_row(edge: PartEdge) -> dict[str, object]:
 
 
 def as_json(shape: PartShape, folder: Path) -> dict[str, object]:
-    """The whole part for JSON; every edge, tangent ones too."""
+    """Return the whole part for JSON; every edge, tangent ones too."""
     return {
         "state": "done",
         "file": shape.name,
@@ -177,7 +177,7 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
 
 
 def _scene(shape: PartShape, seams: list[Seam]) -> dict[str, Any]:
-    """The part's largest triangles and its seams for the 3D page, mm."""
+    """Return the part's largest triangles and its seams for the 3D page, mm."""
     mesh = shape.mesh
     largest = np.argsort(-np.linalg.norm(mesh.area_vectors, axis=1), kind="stable")[: 4 * MOST_DRAWN]
     used, index = np.unique(mesh.triangles[largest], return_inverse=True)

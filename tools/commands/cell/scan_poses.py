@@ -148,7 +148,7 @@ def _spread(scanner: ScannerPreset, size: Array) -> tuple[Array, float]:
 
 
 def _views(axes: Array, middle: Array, side: float, places: Array, distance: float) -> Iterator[list[RigidTransform]]:
-    """Poses X_BC of the scans, for each tilt and both ways to hold the scanner."""
+    """Return poses X_BC of the scans, for each tilt and both orientations of the scanner."""
     along, across, up = axes.T
     for tilt in np.radians(TILTS_DEG):
         back = math.cos(tilt) * up + side * math.sin(tilt) * across

@@ -69,7 +69,7 @@ class SchemaKey:
 
 
 def keys_of(config: type) -> tuple[SchemaKey, ...]:
-    """The keys of a dataclass, those of its base classes included, in their order."""
+    """Return the keys of a dataclass, those of its base classes included, in their order."""
     comments: dict[str, str] = {}
     for base in reversed(config.__mro__):
         if dc.is_dataclass(base) and "__dataclass_fields__" in vars(base):
@@ -108,7 +108,7 @@ def _comments(config: type) -> dict[str, str]:
 
 
 def yaml_of(value: Any) -> str:
-    """A plain value, list or dataclass as YAML on one line; of a dataclass only what is not its default."""
+    """Return a plain value, list or dataclass as YAML on one line; of a dataclass only what is not its default."""
     if dc.is_dataclass(value) and not isinstance(value, type):
         changed = (f"{key.name}: {yaml_of(given)}" for key, given in changed_keys(value))
         return f"{{{', '.join(changed)}}}"
@@ -123,13 +123,13 @@ def yaml_of(value: Any) -> str:
 
 
 def changed_keys(config: Any) -> list[tuple[SchemaKey, Any]]:
-    """The keys of a configuration that do not have their default, each with its value."""
+    """Return the keys of a configuration that do not have their default, each with its value."""
     pairs = ((key, getattr(config, key.name)) for key in keys_of(type(config)))
     return [(key, value) for key, value in pairs if value != key.default]
 
 
 def kind_in_words(kind: Any) -> str:
-    """A type as a reader of the reference needs it."""
+    """Return a type as a reader of the reference needs it."""
     if isinstance(kind, UnionType):
         kinds = [k for k in get_args(kind) if k is not NoneType]
         return " or ".join(dict.fromkeys(kind_in_words(k) for k in kinds))
@@ -141,7 +141,7 @@ def kind_in_words(kind: Any) -> str:
 
 @cache
 def json_schema() -> dict[str, Any]:
-    """The schema; drivers are told apart by their keys, because a JSON schema does not see a YAML tag."""
+    """Return the schema; drivers are recognised by their keys, because a JSON schema has no YAML tags."""
     meanings = {key.name: key.meaning for key in keys_of(Scenario)}
     return {"$schema": DIALECT, "title": "weldcal scenario", **_object(scenario_class(), meanings)}
 
@@ -172,7 +172,7 @@ def _value(kind: Any) -> dict[str, Any]:
 
 
 def reference() -> str:
-    """The page."""
+    """Return the page."""
     return HEAD + "".join(_sections())
 
 

@@ -62,7 +62,7 @@ class Seam:
         return yes if self.felt else f"{yes}; by the scan, not felt (its sigma comes with the scan)"
 
     def as_row(self) -> dict[str, Any]:
-        """The seam for JSON: millimetres and degrees."""
+        """Return the seam for JSON: millimetres and degrees."""
         j = self.joint
         return {
             "type": f"{j.type} {j.side}".strip(),
@@ -196,14 +196,14 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
 
 
 def joint_of(edge: PartEdge) -> str:
-    """The kind of joint at an edge, by its angle."""
+    """Return the kind of joint at an edge, by its angle."""
     if edge.kind == "flush":
         return "butt"
     return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
 
 
 def to_try(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
-    """The seams to try, at most MOST_TRIED, each by its edges.
+    """Return the seams to try, at most MOST_TRIED, each by its edges.
 
     Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
     """

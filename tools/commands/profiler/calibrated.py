@@ -98,7 +98,7 @@ def clock(
 
 
 def _source(folder: Path, skip: set[Path]) -> Path:
-    """The file or folder of the profiles: profiles.csv, or the only other one beside stream.csv."""
+    """Return the file or folder of the profiles: profiles.csv, or the only other one beside stream.csv."""
     plain = folder / "profiles.csv"
     found = [plain] if plain.exists() else []
     if not found and folder.is_dir():
@@ -195,7 +195,7 @@ def seam(
 
 
 def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
-    """The measurements with their poses read as those of the calibration were.
+    """Return the measurements with their poses read as those of the calibration were.
 
     Raises InputError where several readings are left.
     """

@@ -79,7 +79,7 @@ def edge(
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial
+    """Calibrate the profiler's pose on the flange by points of one straight edge, from any poses. Needs no initial
     guess."""
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
@@ -101,7 +101,7 @@ def edge(
 
 
 def _decided(data: Measurements, feature: str, side: str) -> Measurements:
-    """The measurements with the reading of the poses that the edge selects."""
+    """Return the measurements with the reading of the poses that the edge selects."""
     if len(data.readings) < 2:
         return data
     points, _ = edge_points(data, feature, side)
@@ -201,7 +201,7 @@ def edge_points(file: Measurements, feature: str, side: str) -> tuple[Floats, li
 
 
 def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[EdgeEstimate, Sigmas]:
-    """The joint estimate, and the sigmas that it uses.
+    """Return the joint estimate, and the sigmas that it uses.
 
     Where none are stated, the usual ones are scaled up together until they agree with the residuals: otherwise good
     points of a noisier sensor would be rejected as outliers, which biases the estimate and makes its sigma too small. A

@@ -78,7 +78,7 @@ class Measurements:
     notes: tuple[str, ...] = ()
 
     def decided(self, fit: Fit, what: str) -> "Measurements":
-        """The same with the reading of the poses that the profiles select.
+        """Return the same with the reading of the poses that the profiles select.
 
         Raises InconsistentData where they select none.
         """
@@ -88,7 +88,7 @@ class Measurements:
         return self.read_as(k, sentence)
 
     def read_as(self, k: int, sentence: str = "") -> "Measurements":
-        """The same with one of the readings."""
+        """Return the same with one of the readings."""
         poses, one = flange_poses(self.readings[k]), self.readings[k]
         arrays = {**self.arrays, "rotation": poses.rotation, "translation": poses.translation}
         reading = {**self.reading, "robot": {**self.reading.get("robot", {}), "reading": one.form}}
@@ -101,7 +101,7 @@ class Measurements:
         )
 
     def with_form(self, form: str) -> "Measurements":
-        """The same with the reading of this form where the numbers allow several and it is one of them."""
+        """Return the same with the reading of this form where the numbers allow several and it is one of them."""
         k = next((k for k, one in enumerate(self.readings) if one.form == form), None)
         return (
             self if k is None or len(self.readings) < 2 else self.read_as(k, f"Poses read as {self.readings[k].words}.")
@@ -122,7 +122,7 @@ class Measurements:
         return None if R is None or t is None else FlangePoses.checked(R, t)
 
     def needed(self, name: str, why: str) -> Floats:
-        """An array that the command cannot do without.
+        """Return an array that the command cannot do without.
 
         Raises:
             InputError: it is not there.
@@ -133,7 +133,7 @@ class Measurements:
         return self.arrays[name]
 
     def arm(self) -> DhArm | None:
-        """The arm's table, where the file has one."""
+        """Return the arm's table, where the file has one."""
         return DhArm.checked(self.arrays["dh"]) if "dh" in self.arrays else None
 
 
@@ -189,7 +189,7 @@ def read_profiler_file(
 
 
 def _is_own_table(path: Path) -> bool:
-    """Whether a table is in this package's own form: a flange position and a rotation vector in every row."""
+    """Return whether a table is in this package's own form: a flange position and a rotation vector in every row."""
     if path.suffix.lower() != ".csv" or path.is_dir():
         return False
     first = next(
@@ -199,7 +199,7 @@ def _is_own_table(path: Path) -> bool:
 
 
 def _imported(path: Path, unit: str | None, stated: PosesStated) -> Measurements:
-    """An export, a table with poses in another form, or a folder."""
+    """Return an export, a table with poses in another form, or a folder."""
     found = import_profiles(path, poses=stated.poses, form=stated.form, unit=unit, pitch_mm=stated.pitch_mm)
     poses = flange_poses(found.readings[0])
     arrays = {"rotation": poses.rotation, "translation": poses.translation}

@@ -108,7 +108,7 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
 
 
 def _npz(arm: ArmModel, taken: Sequence[TakenProfile], more: Mapping[str, Any]) -> bytes:
-    """The bytes of an npz file with flange poses, joints and raw profiles."""
+    """Return the bytes of an npz file with flange poses, joints and raw profiles."""
     T = np.array([forward_kinematics(arm, t.q).GetAsMatrix4() for t in taken])
     out = io.BytesIO()
     np.savez_compressed(

@@ -108,7 +108,7 @@ class Sigmas:
             raise InputError("The sigmas of x and z must be positive, and the robot's not negative.")
 
     def times(self, factor: float) -> "Sigmas":
-        """All of them multiplied by a factor."""
+        """Return all of them multiplied by a factor."""
         return Sigmas(factor * self.robot_m, factor * self.x_m, factor * self.z_m, self.stated)
 
 
@@ -120,7 +120,7 @@ def check_number(poses: FlangePoses, shape: tuple[int, ...], what: str, each: tu
 
 
 def widened(e: Estimate) -> Estimate:
-    """The estimate with the covariance that its residuals support."""
+    """Return the estimate with the covariance that its residuals support."""
     return replace(e, covariance=believed_covariance(e))
 
 
@@ -140,7 +140,7 @@ def figures_of(e: ProfilerEstimate) -> dict[str, Any]:
 
 
 def next_poses(candidates: FlangePoses, chosen: tuple[int, ...], rms_m: Floats) -> dict[str, Any]:
-    """The proposed poses (m, rad) and the error in the field before and after each, for the JSON object."""
+    """Return the proposed poses (m, rad) and the error in the field before and after each, for the JSON object."""
     turns = Rotation.from_matrix(candidates.rotation).as_rotvec()
     return {
         "poses": [[float(v) for v in (*candidates.translation[k], *turns[k])] for k in chosen],

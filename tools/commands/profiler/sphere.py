@@ -117,7 +117,7 @@ def read_sphere(
     lost: list[int] | None = None,
     stated: PosesStated | None = None,
 ) -> tuple[Measurements, SphereData]:
-    """The measurements of a sphere and its touches, with the reading of the poses that the arcs select."""
+    """Return the measurements of a sphere and its touches, with the reading of the poses that the arcs select."""
     tip_m = parse_tip(tip)
     stated = stated or PosesStated()
     data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial, stated=stated)
@@ -153,7 +153,7 @@ def sphere_data(
     lost: list[int] | None = None,
     seed: int = 0,
 ) -> SphereData:
-    """A file's measurements of a sphere: the detected arcs, with touches and joints where there are any.
+    """Return a file's measurements of a sphere: the detected arcs, with touches and joints where there are any.
 
     Scans without an arc are not used and their numbers added to `lost`; without that list they are refused.
     """
@@ -196,7 +196,7 @@ def sphere_data(
 
 
 def parse_tip(text: str) -> Floats | None:
-    """The tip (3,) m of the option --tip, "x,y,z" in mm; None where it is empty.
+    """Return the tip (3,) m of the option --tip, "x,y,z" in mm; None where it is empty.
 
     Raises:
         InputError: not three numbers.
@@ -214,7 +214,7 @@ def parse_tip(text: str) -> Floats | None:
 
 
 def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
-    """The sphere's points of a profile: all of them where they form one arc, else those detected."""
+    """Return the sphere's points of a profile: all of them where they form one arc, else those detected."""
     p = profile[np.isfinite(profile).all(axis=1)]
     if len(p) >= 5:
         circle, rms = fit_circle(p)
@@ -286,7 +286,7 @@ def _refuse_inverse_poses(scans: SphereData, rigid: SphereEstimate | None, s: Sp
 
 
 def _rigid(scans: SphereData, s: SphereSigmas) -> SphereEstimate | None:
-    """The rigid model's estimate; None where it refuses."""
+    """Return the rigid model's estimate; None where it refuses."""
     try:
         return sphere_joint(scans, "rigid", s)
     except WeldcalError:

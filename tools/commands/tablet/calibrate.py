@@ -115,7 +115,7 @@ class TabletCalibration:
         return tablet_screen(self.result, self.held_out_mm, self.limit_mm, self.no_tolerance)
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `tablet calibrate`."""
+        """Return the JSON object of `tablet calibrate`."""
         result = self.result
         stages = result.two_stages or {}
         left_out = [v for v in result.leave_one_out_mm if v is not None]
@@ -197,7 +197,7 @@ def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
 
 
 def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
-    """The paper's scheme in its search ranges (Table 5), for a setup like the paper's."""
+    """Return the paper's scheme in its search ranges (Table 5), for a setup like the paper's."""
     first = tablet_stage1(touches, sign=sign)
     second = tablet_stage2(touches, first.parameters, sign=sign)
     return {
@@ -262,5 +262,5 @@ def _lengths_mm(errors_m: np.ndarray) -> list[float]:
 
 
 def _finite(values: list[float]) -> list[float | None]:
-    """The values, None where a landmark could not be held out; empty where none could."""
+    """Return the values, None where a landmark could not be held out; empty where none could."""
     return [v if np.isfinite(v) else None for v in values] if np.isfinite(values).any() else []

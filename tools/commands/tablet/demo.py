@@ -62,7 +62,7 @@ class TabletDemo:
         return run_screen(made, self.run.reason or "", self.found, self.run.ended_by_operator)
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `tablet demo`."""
+        """Return the JSON object of `tablet demo`."""
         said = run_document(self.run, self.options, self.robot)
         touches = len(self.run.cell.job.state(self.run.root).touches)
         return {**said, "n_touches": touches, **self.found, **self.run.timing()}

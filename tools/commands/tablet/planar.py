@@ -195,7 +195,7 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
 
 
 def _odd_landmarks(visit: PlanarVisit, planar: PlanarFit, config: PlanarConfig) -> list[str]:
-    """A landmark without which all the others fit far better: touched or read wrongly."""
+    """Return a landmark without which all the others fit far better: touched or read wrongly."""
     touches, number = visit.touches, same_landmark(visit.touches.landmark_px)
     if number.max() + 1 < _LEAST_FOR_OUTLIER:
         return []
@@ -244,7 +244,7 @@ class ManyVisits:
         return np.concatenate([v.held_out_mm(model) for v in self.visits])
 
     def summary(self) -> dict[str, object]:
-        """The JSON object of `tablet calibrate` for such a file."""
+        """Return the JSON object of `tablet calibrate` for such a file."""
         others = {m: error_figures(self.held_out_mm(m)) for m in self.errors_mm if m != self.model}
         warnings = sorted({text for v in self.visits for text in v.warnings})
         return {

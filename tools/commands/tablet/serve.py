@@ -40,7 +40,7 @@ def serve(
 
 
 def page() -> str:
-    """The page: one self-contained HTML text."""
+    """Return the page: one self-contained HTML text."""
     return files("weldcal.tools.commands.tablet").joinpath("tablet.html").read_text(encoding="utf-8")
 
 
@@ -59,7 +59,7 @@ class TabletServer(Limited, ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
 
     def address(self, host: str) -> str:
-        """The page's URL on a host."""
+        """Return the page's URL on a host."""
         return f"http://{_in_url(host)}:{self.server_address[1]}/{self.token}/"
 
     def take(self, text: str) -> Path:
@@ -111,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _welcome(self, name: str) -> bool:
-        """Whether the request names this server and this path; a refusal is sent otherwise."""
+        """Return whether the request names this server and this path; a refusal is sent otherwise."""
         if f"http://{self.headers.get('Host', '')}" not in self._own():
             self._say(HTTPStatus.MISDIRECTED_REQUEST, "This server has another name.")
             return False
@@ -140,7 +140,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def open_server(host: str, port: int, folder: Path, said: Callable[[str], None]) -> TabletServer:
-    """A server that listens but does not serve yet; port 0 takes any free one.
+    """Return a server that listens but does not serve yet; port 0 takes any free one.
 
     Raises:
         InputError: the port is in use or not allowed, or the host is not an IP address of this machine.
@@ -159,7 +159,7 @@ def open_server(host: str, port: int, folder: Path, said: Callable[[str], None])
 
 
 def tablet_host(host: str) -> str:
-    """The address of this machine to open on the tablet, for a server that listens on `host`."""
+    """Return the address of this machine to open on the tablet, for a server that listens on `host`."""
     if not ipaddress.ip_address(host).is_unspecified:
         return host
     return network_address()

@@ -103,7 +103,7 @@ def _handler(stream: PictureStream) -> type[BaseHTTPRequestHandler]:
 
 
 def draw(view: TagView, X_FM: Array, noise_grey: float, rng: np.random.Generator) -> bytes:
-    """The JPEG of the tag at X_FM (4, 4)."""
+    """Return the JPEG of the tag at X_FM (4, 4)."""
     grey = with_noise(view.picture(RigidTransform(X_FM)), noise_grey, rng)
     _, jpeg = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return bytes(jpeg)

@@ -60,7 +60,7 @@ class Repeatability:
         self._wanted, self._offset = np.zeros(6), np.zeros(6)
 
     def true_joints(self, q: Array, qd: Array) -> Array:
-        """The true joints (6,) rad of this step for the reported ones and their velocities (6,) rad/s."""
+        """Return the true joints (6,) rad of this step for the reported ones and their velocities (6,) rad/s."""
         if self._mm == 0.0:
             return q
         moves = bool(np.abs(qd).max() > 1e-9)
@@ -78,7 +78,7 @@ class Repeatability:
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
-    """The simulated station of a scenario whose arm stands where its controller has moved it.
+    """Return the simulated station of a scenario whose arm is where its controller has moved it.
 
     All else follows from `seed`.
 
@@ -143,7 +143,7 @@ class Physics:
         self._touches = False
 
     def step(self, q: Array, qd: Array, arc: Arc) -> None:
-        """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc` tells whether the arc burns."""
+        """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc`: whether the arc burns."""
         self._frame += 1
         self.time_s = STEP_S * self._frame
         true_q = self._true_q = self._joints.true_joints(q, qd)
@@ -188,14 +188,14 @@ class Physics:
         self.torch.clear()
 
     def positions(self) -> Array:
-        """All positions of the plant, as the scanner's process poses its copy of it."""
+        """Return all positions of the plant, as the scanner's process poses its copy of it."""
         found = np.array(self.world.plant.GetPositions(self._plant_context))
         if self._torch_port is None:
             found[:6] = self._true_q
         return found
 
     def tag(self) -> Array:
-        """The tag's pose in the flange frame, X_FM (4, 4), with the soft tip as it is bent now."""
+        """Return the tag's pose in the flange frame, X_FM (4, 4), with the soft tip as it is bent now."""
         assert self._tag is not None
         plate, tip, X_TM = self._tag
         poses = self._poses.Eval(self._plant_context)

@@ -58,7 +58,7 @@ class Played:
     truth_file: Path
 
     def truth(self) -> dict[str, Any]:
-        """The contents of the truth file."""
+        """Return the contents of the truth file."""
         found: dict[str, Any] = json.loads(self.truth_file.read_text(encoding="utf-8"))
         return found
 

@@ -48,7 +48,7 @@ class Scans:
         self._waited_s = 0.0
 
     def answer(self, time_s: float) -> None:
-        """Take what the scanner has said by this time of the world (s). Never waits."""
+        """Take what the scanner has sent by this time of the world (s). Never waits."""
         with contextlib.suppress(OSError, EOFError):
             while self._pipe.poll(0.0):
                 if self._pipe.recv() == POSE:
@@ -93,7 +93,7 @@ class Renderer:
         self._scans = 0
 
     def scan(self, positions: Array) -> Array:
-        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest.
+        """Return the organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest.
 
         A profile is (n, 2) m.
         """

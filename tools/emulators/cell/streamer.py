@@ -88,7 +88,7 @@ class FrameRenderer:
         self._sensor_context = sensor.GetMyContextFromRoot(self._context)
 
     def cloud(self, it: Exposure) -> NDArray[np.float32]:
-        """The organised cloud (H, W, 3) m, float32."""
+        """Return the organised cloud (H, W, 3) m, float32."""
         # the stand jumps at a time of the copy's context
         knock_s = self._config.knock_s
         self._context.SetTime(0.0 if knock_s is None else knock_s + (1.0 if it.knocked else -1.0))
@@ -141,13 +141,13 @@ class Streamer:
         self.knocked_at_s: float | None = None
 
     def knock(self, now: float) -> None:
-        """Knock the scanner's stand at `now`, s of the world.
+        """Displace the scanner's stand at `now`, s of the world.
 
         Raises InputError where the world's scenario has no such stand.
         """
         if self._knock_s is None:
             raise InputError(
-                "Write scanner.knock_s and knock_mm in the world's scenario: then its stand can be knocked."
+                "The scanner's stand cannot be displaced: write scanner.knock_s and knock_mm in the world's scenario."
             )
         self.knocked_at_s = now if self.knocked_at_s is None else self.knocked_at_s
 
@@ -163,7 +163,7 @@ class Streamer:
             self._waiter.send(self._underway.popleft()[1])  # no frame is late by more than this computer
 
     def truth(self) -> dict[str, object]:
-        """The scanner's clock, its reading (s) at the world's time 0, its rate, and when its stand was moved."""
+        """Return the scanner's clock, its reading (s) at the world's time 0, its rate, and when its stand was moved."""
         t = self._timing
         clock = {"at_0_s": t.device_epoch_s, "rate": 1.0 + 1e-6 * t.device_drift_ppm}
         return {"scanner_clock": clock, "knocked_at_s": self.knocked_at_s}

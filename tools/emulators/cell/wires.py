@@ -67,7 +67,7 @@ class TouchProbe:
         self.how = how
 
     def step(self, q: Array) -> bool:
-        """The input's level for the true joints (6,) rad of this frame."""
+        """Return the input's level for the true joints (6,) rad of this frame."""
         tip = tick_flange_pose(self.arm, q).multiply(self.truth.p_FTip)
         depth = self.truth.radius_m + TIP_RADIUS_M - float(np.linalg.norm(tip - self.truth.center))
         self.touches += depth > 0.0 and not self._contact
@@ -96,7 +96,7 @@ class InputWire:
     _noise_until: float = 0.0
 
     def step(self, now: float, established: bool, fault: bool) -> tuple[bool, bool]:
-        """The inputs at `now` (s) for an arc that is established and a power source at fault, or not."""
+        """Return the inputs at `now` (s) for an arc that is established and a power source at fault, or not."""
         right = (established, fault)
         if not self._sent or self._sent[-1][1] != right:
             self._sent.append((now, right))

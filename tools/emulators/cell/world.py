@@ -67,7 +67,7 @@ class Wires:
 
 
 def wires_of(cell: Scenario) -> Wires:
-    """The wires of a cell's scenario, all on loopback.
+    """Return the wires of a cell's scenario, all on loopback.
 
     Raises:
         InputError: a device of the scenario is not by wire, or not on loopback.
@@ -192,7 +192,7 @@ class _World:
 
     def _knock(self) -> None:
         if self._streamer is None:
-            raise InputError("Only the stand of a scanner that streams is knocked.")
+            raise InputError("Only the stand of a scanner that streams can be displaced: use a scenario with one.")
         self._streamer.knock(self._physics.time_s)
         self.write()
 
@@ -226,13 +226,13 @@ class _World:
             self._waiter.send(self._pictures.popleft()[1])
 
     def answer_scanner(self) -> None:
-        """Tell the scanner how the world stands, where it has asked."""
+        """Send the scanner the state of the world, where it has asked."""
         if self._scans is not None:
             self._scans.answer(self._physics.time_s)
 
 
 def _probe_of(physics: Physics, config: UrTouchProbe | None) -> TouchProbe | None:
-    """The world's touch probe; raises InputError where the world has no sphere that it could touch."""
+    """Return the world's touch probe; raises InputError where the world has no sphere that it could touch."""
     if config is None:
         return None
     truth = physics.station.truth.profiler

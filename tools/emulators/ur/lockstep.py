@@ -48,7 +48,7 @@ class Lockstep:
         self._silenced = self._client
 
     def waits(self, now: float) -> bool:
-        """Whether the next frame has to wait for the client's next package."""
+        """Return whether the next frame has to wait for the client's next package."""
         if not (self._bound_s and self._may_come(now) and self._is_late()):
             self._end_wait(now)
             return False

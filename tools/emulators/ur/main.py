@@ -109,7 +109,7 @@ def run_emulator(
 
 
 def narrowed(model: ArmModel, ranges: str) -> ArmModel:
-    """The arm with the joint ranges "LOWER:UPPER,..." (deg); the arm as it is where there are none.
+    """Return the arm with the joint ranges "LOWER:UPPER,..." (deg); the arm as it is where there are none.
 
     Raises:
         InputError: these are not six ranges inside the arm's own.

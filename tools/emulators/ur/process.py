@@ -72,7 +72,7 @@ def free_address(ports: Sequence[int]) -> Iterator[str]:
 
 
 def first_taken(host: str, ports: Sequence[int]) -> int:
-    """The first of these ports on which something listens at this address; 0 where all are free."""
+    """Return the first of these ports on which something listens at this address; 0 where all are free."""
     for port in ports:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -84,7 +84,7 @@ def first_taken(host: str, ports: Sequence[int]) -> int:
 
 
 def lock_path(host: str) -> Path:
-    """The file whose lock keeps the ports of one address for one owner."""
+    """Return the file whose lock keeps the ports of one address for one owner."""
     name = f"weldcal-ur-emulator-{os.getuid()}" + ("" if host == DEFAULT else f"-{host}")
     return Path(tempfile.gettempdir()) / f"{name}.lock"
 
@@ -184,7 +184,7 @@ def emulator_process(
 ) -> Iterator[Emulator]:
     """An emulator that listens, under the lock that keeps its address's ports for one owner at a time.
 
-    The child ends with the block, and with this process (`--parent`) where that is killed; it has a session of its own,
+    The child ends with the block, and with this process (`--parent`) where that is killed. It has a session of its own,
     so that Ctrl-C reaches its user and not the controller.
 
     Args:

@@ -33,7 +33,7 @@ class Version:
         return self.at_least((0, 0), (10, 10))
 
     def at_least(self, five: tuple[int, int], ten: tuple[int, int] = (10, 0)) -> bool:
-        """Whether this is at least the given 5.x, or the given 10.x."""
+        """Return whether this is at least the given 5.x, or the given 10.x."""
         return (self.major, self.minor) >= (ten if self.major >= 10 else five)
 
 

@@ -66,7 +66,7 @@ class PhaseCpu:
 
 
 def cases(scenarios: Iterable[str], seeds: range, seam_mm: float | None = None, law: str = "guarded") -> Cases:
-    """Every scenario with every seed.
+    """Return every scenario with every seed.
 
     Raises:
         InputError: no such scenario or law.

@@ -46,7 +46,7 @@ def edge_blur(points_C: Array, fit: FlangeFit, *, outer: bool) -> tuple[float, f
     """
     radius = fit.outer_radius_m if outer else fit.bore_radius_m
     if radius is None:
-        raise ValueError("the edge was not seen")
+        raise ValueError("the edge is not in the scan")
     d = points_C - fit.center_C
     h = d @ fit.normal_C
     rho = np.sqrt(np.maximum((d * d).sum(axis=1) - h * h, 0.0))[np.abs(h) < max(3.0 * fit.plane_rms_m, 0.0002)]
@@ -70,7 +70,7 @@ def center_bound(points_C: Array, fit: FlangeFit, parts: int) -> float:
     """Least rms distance (m) between the centres from two of ``parts`` random parts of a cloud, in the face's plane.
 
     Information of one edge about a coordinate of its centre: density x circumference x 0.90 / blur / 2, Poisson points,
-    radius free (a full circle's centre does not depend on it); both edges add.
+    radius free (a full circle's centre does not depend on it). Both edges add.
     """
     information = 0.0
     for outer, radius in ((True, fit.outer_radius_m), (False, fit.bore_radius_m)):
@@ -125,7 +125,7 @@ _DRAWS = 2000
 
 
 def median_sigma(values: Array, seed: int = 0) -> float:
-    """How well values (n,) tell their median: its bootstrap standard deviation."""
+    """Return the bootstrap standard deviation of the median of values (n,)."""
     draws = np.random.default_rng(seed).choice(values, (_DRAWS, len(values)))
     return float(np.median(draws, axis=1).std())
 
@@ -165,7 +165,7 @@ class Draws:
 def study_few_scans(
     folder: Path, draws: int = 60, seed: int = 0, sizes: Sequence[int] = SIZES, progress: Progress = no_progress
 ) -> list[Draws]:
-    """One row a size, as far as KEPT scans remain.
+    """Return one row a size, as long as KEPT scans remain.
 
     From one scan the pose rests on the turn of the drilled holes about the flange's axis, which is known from a
     calibration with all scans. Raises InputError for a folder that is none, TooFewPoses where nothing remains.

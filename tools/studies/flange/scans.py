@@ -28,7 +28,7 @@ _WRONG_RAD = float(np.radians(10.0))  # half of the least symmetry that a patter
 
 
 def fit_one(width: int, flange: str, rng: Sequence[int], kind: str, share: float = 0.5) -> dict[str, Any]:
-    """Fit the flange of one frame: "whole", "empty", or hidden in one of WAYS. Its error (m), or why there is none."""
+    """Fit the flange of one frame ("whole", "empty", or hidden, see WAYS): its error (m), or why there is none."""
     scanner, standard, draw = get_scanner("phoxi_m", width), get_flange(flange), np.random.default_rng(list(rng))
     try:
         if kind == "empty":
@@ -101,7 +101,7 @@ def frames(
 def hidden_cases(
     count: int, share: float, seed: int, width: int, flange: str = FLANGE, ways: Sequence[str] = WAYS
 ) -> Cases:
-    """``count`` frames of each way to hide ``share`` of the flange's width."""
+    """Return ``count`` frames of each obstacle that hides ``share`` of the flange's width."""
     of = {"width": width, "flange": flange, "share": share}
     return {f"{way} {k}": {**of, "rng": [seed, k], "kind": way} for way in ways for k in range(count)}
 
@@ -175,7 +175,7 @@ def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], 
 
 
 def _with_filled(standard: FlangeStandard, filled: Sequence[int]) -> FlangeStandard:
-    """The flange without these of its openings (threads in order, then the dowel hole)."""
+    """Return the flange without these of its openings (threads in order, then the dowel hole)."""
     threads = tuple(a for k, a in enumerate(standard.hole_angles_rad) if k not in filled)
     pin = 0.0 if standard.n_holes in filled else standard.pin_m
     return replace(standard, n_holes=len(threads), hole_angles_rad=threads, pin_m=pin)

@@ -34,7 +34,7 @@ found nothing)."""
 
 
 def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
-    """Every way on the same simulated PhoXi M scans; single thread where the method's library lets us ask for it.
+    """Time every method on the same simulated PhoXi M scans; on one thread where its library allows that.
 
     ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
     """
@@ -95,7 +95,7 @@ def _time(
 
 
 def _segmented(frame: FlangeScan, outer_m: float) -> tuple[Array, Array]:
-    """The flange's own points of a frame, thinned to a recorded cloud's number, and the true centre."""
+    """Return the flange's own points of a frame, thinned to a recorded cloud's number, and the true centre."""
     assert frame.X_CR is not None
     p = frame.points_C.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
@@ -132,7 +132,7 @@ def _search(points: Array, seed: int, count: Callable[[Array, float], int]) -> A
 
 
 def _paper_loop(points: Array, seed: int) -> Array | None:
-    """The search as the paper's Python program does it: points are counted one by one."""
+    """Return the search as the paper's Python program does it: points are counted one by one."""
     everything = points.tolist()
 
     def count(center: Array, radius: float) -> int:
@@ -147,7 +147,7 @@ def _paper_loop(points: Array, seed: int) -> Array | None:
 
 
 def _ransac(points: Array, seed: int) -> Array | None:
-    """The search with each count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
+    """Return the search with each count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
     return _search(points, seed, lambda c, r: int((np.abs(np.linalg.norm(points - c, axis=1) - r) < _E_D).sum()))
 
 

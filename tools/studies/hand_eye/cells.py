@@ -112,7 +112,7 @@ def run_mounting(name: str, seed: int, kind: str, folder: str = "") -> Mapping[s
 
 
 def _light(name: str, world: MountedWorld, kind: str) -> RecordedMounting:
-    """The report of a light world's scans."""
+    """Return the report of a light world's scans."""
     limits, scene, seen = load_scenario(name).calibration, world.scene, world.seen
     n = limits.minimum_scans if kind == LIVE else len(seen)
     while n < len(seen) and 1e3 * expected_error(scene, solve_mounting(scene, seen[:n]))[1] > limits.required_error_mm:

@@ -69,7 +69,7 @@ class DatasetRow:
 
 @dataclass
 class HandEyeBenchmark:
-    """All rows; ``checks``: name -> (held, what was seen)."""
+    """Hold all rows; ``checks``: name -> (held, what was found)."""
 
     rows: list[DatasetRow] = field(default_factory=list)
     checks: dict[str, tuple[bool, str]] = field(default_factory=dict)
@@ -242,7 +242,7 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
 
 
 def degenerate(seed: int = 0) -> dict[str, str]:
-    """Return the error or open direction named for undetermined motions; "answer": a number without a warning."""
+    """Return the error or unobservable direction of undetermined motions; "answer": a number without a warning."""
     rng = np.random.default_rng(seed)
     problem, truth = simulated("eye_in_hand", 20, rng, float(np.radians(0.05)), 2e-4)
     X, Y = truth["X"], truth["Y"]

@@ -48,13 +48,13 @@ def _chosen(case: WrittenSet) -> Mapping[str, object]:
 
 
 def _determined(clean: ReadingDecision, case: WrittenSet) -> bool:
-    """Whether the next reading that leads to another result leaves residuals over SIGMAS of the noise."""
+    """Return whether the next reading that leads to another result leaves residuals over SIGMAS of the noise."""
     others = [one for one in (*clean.rivals, clean.next) if one is not None]
     return all(max(one.rotation / case.rotation, one.position / case.position) > SIGMAS for one in others)
 
 
 def _near(found: ReadingDecision, case: WrittenSet) -> bool:
-    """Whether X is within the errors that the noise causes."""
+    """Return whether X is within the errors that the noise causes."""
     n, best = len(case.robot.p), found.best
     turn = Rotation.from_matrix(best.X[:3, :3].T @ case.X[:3, :3]).magnitude()
     shift = float(np.linalg.norm(best.X[:3, 3] / case.scale - case.X[:3, 3]))

@@ -46,7 +46,7 @@ def motion_data(
         str, option("--warm-up", "TAU,PPM[,PPM/M]", "The scanner's scale error dies away: s, ppm.", show_default="none")
     ] = "",
 ) -> Mapping[str, object]:
-    """Write a simulated recording in motion: a UR arm moves through a cube's corners, seen by a streaming scanner.
+    """Write a simulated recording in motion: a UR arm moves through a cube's corners before a streaming scanner.
 
     The recording is the folder 'dataset', the truth of pose and clock the file truth.json beside it.
     """

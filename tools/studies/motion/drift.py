@@ -1,4 +1,4 @@
-"""`weldcal benchmark drift`: knocks, creeps and quiet hours of a watched calibration, on a world of features."""
+"""Run `weldcal benchmark drift`: jumps, creeps and quiet hours of a monitored calibration, on a world of features."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -32,7 +32,7 @@ class DriftTrial:
 
     ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of
     the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
-    threshold; ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
+    threshold. ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
     change was, in the same units.
     """
 
@@ -77,7 +77,7 @@ def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapp
 
 
 def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
-    """Knocks, of which every other one shifts and turns, creeps, and one recording of quiet hours."""
+    """Return jumps, of which every other one shifts and turns, creeps, and one recording of quiet hours."""
     kinds = [("turn" if k % 2 else "shift", seed + k) for k in range(knocks)]
     kinds += [("creep", seed + 5000 + k) for k in range(creeps)]
     out: dict[str, dict[str, Any]] = {f"{kind} {n}": {"kind": kind, "seed": n, "stamps": stamps} for kind, n in kinds}
@@ -123,7 +123,7 @@ def _figures(results: Results) -> Figures:
 
 
 def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
-    """A trial's fields; JSON has null for NaN."""
+    """Return a trial's fields; JSON has null for NaN."""
     return {name: float("nan") if value is None else value for name, value in result.items()}
 
 
@@ -161,7 +161,7 @@ def benchmark_drift(
     stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
     quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
 ) -> Outcome:
-    """Measure the drift test: how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
+    """Measure the drift test: how soon jumps of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
     if stamps not in ("device", "arrival"):
         raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
     size = (2, 1, 0.01) if quick else (runs, creeps, hours)
@@ -169,7 +169,7 @@ def benchmark_drift(
 
 
 def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
-    """A recording of some 40 s with a knock of 0.2 mm, or 0.03 degrees, along or about a random axis."""
+    """Return a recording of some 40 s with a jump of 0.2 mm, or 0.03 degrees, along or about a random axis."""
     rng = np.random.default_rng([seed, 3])
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
@@ -181,7 +181,7 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
 
 
 def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
-    """A recording with a creep of 0.02 mm/min in a random direction."""
+    """Return a recording with a creep of 0.02 mm/min in a random direction."""
     rng = np.random.default_rng([seed, 4])
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
@@ -233,13 +233,13 @@ def expected_late(knocks: Sequence[DriftTrial]) -> float:
 
 
 def _moved(w: FeatureWorld, change: tuple[float, Array, Array]) -> Array:
-    """A change [rotation; translation] (6,) about the pivot."""
+    """Return a change [rotation; translation] (6,) about the pivot."""
     _, shift, rotation = change
     return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
 
 
 def _within(w: FeatureWorld, at: float) -> NDArray[np.intp]:
-    """The frames of WITHIN_S after a time."""
+    """Return the frames of WITHIN_S after a time."""
     return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
 
 

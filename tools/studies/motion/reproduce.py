@@ -83,7 +83,7 @@ def history_picture(t: Array, before: Array, after: Array) -> bytes:
 
 
 def after_picture(t: Array, errors: Array) -> bytes:
-    """The right half of Fig. 6 in its own scale."""
+    """Return the right half of Fig. 6 in its own scale."""
     figure = Figure(figsize=(9.0, 3.0), layout="constrained")
     for axes, first, unit in zip(figure.subplots(1, 2), (3, 0), ("mm", "degrees"), strict=True):
         _components(axes, t, errors, first)
@@ -237,7 +237,7 @@ def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: 
 
 
 def _row(errors: Array) -> dict[str, Any]:
-    """A row of Table 1: ICP errors (N, 6) of the flange mesh at poses, degrees and mm in the flange's axes."""
+    """Return a row of Table 1: ICP errors (N, 6) of the flange mesh at poses, degrees and mm in the flange's axes."""
     return {
         "mean": dict(zip(COMPONENTS, errors.mean(axis=0).tolist(), strict=True)),
         "sd": dict(zip(COMPONENTS, errors.std(axis=0).tolist(), strict=True)),
@@ -252,7 +252,7 @@ def _length_rms(errors: Array) -> float:
 
 
 def targets(figures: Figures) -> tuple[Target, ...]:
-    """The bounds; a quick run decides nothing."""
+    """Return the bounds; a quick run decides nothing."""
     x = figures["X_BC_error"]["motion, synchronised"]
     clock, arrival = abs(figures["clock_offset_error_ms"]), abs(figures["arrival_offset_error_ms"])
     static = figures["table_1"]["static mode, SVD"]["rms_mm"]
@@ -323,7 +323,7 @@ class _Verifier:
         self._models: dict[str, Verification] = {}
 
     def model(self, id: str) -> Verification:
-        """The face of one frame against the mesh, without the robot's pose."""
+        """Return the face of one frame against the mesh, without the robot's pose."""
         if id not in self._models:
             cloud = face_cloud(self._data.cloud(id), self._fits[id], self._standard)
             self._models[id] = make_verification(cloud, RigidTransform(), self._standard)

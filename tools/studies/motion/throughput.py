@@ -76,7 +76,7 @@ class Throughput:
         )
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         p = np.percentile(self.wait_ms, [50, 95, 100])
         return {
             "state": "done",

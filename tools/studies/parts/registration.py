@@ -64,13 +64,13 @@ Trial = tuple[str, str, int, bool]
 
 
 def clutter_trials(seeds: Sequence[int]) -> list[Trial]:
-    """A scene a seed: kinds and parts take turns, so that twelve seeds have each part once."""
+    """Return a scene a seed: kinds and parts take turns, so that twelve seeds have each part once."""
     kinds, names = list(SCENES), list(PARTS)
     return [(kinds[(s + s // 12) % len(kinds)], names[s % len(names)], s, False) for s in seeds]
 
 
 def plan_trials(seeds: Sequence[int], names: Sequence[str]) -> list[Trial]:
-    """Every part once a seed, among few things; a hint decides between poses that look the same."""
+    """Return every part once a seed, among few things; a hint decides between poses that look the same."""
     return [("plan", name, seed, True) for name in names for seed in seeds]
 
 

@@ -95,7 +95,7 @@ def edge_figures(name: str, values: Iterable[float]) -> dict[str, float]:
 def edge_rows(
     name: str, trials: Iterable[EdgeTrial], progress: Callable[[float], None], counts: tuple[int, ...] = COUNTS
 ) -> list[EdgeRow]:
-    """All rows of a set, for each of these numbers of orientations."""
+    """Return all rows of a set, for each of these numbers of orientations."""
     found: dict[tuple[int, str], list[Floats]] = {(n, m): [] for n in counts for m in EDGE_METHODS}
     every = list(trials)
     for k, trial in enumerate(every):
@@ -205,7 +205,7 @@ def named_figures(points: Mapping[str, float], seams: Sequence[Floats], bosses: 
 
 
 def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
-    """The four methods on one world's scans and touches."""
+    """Return the four methods on one world's scans and touches."""
     data = world.trial.data
     assert data.touches is not None
     assert data.tip is not None
@@ -231,7 +231,7 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
 
 
 def joint_records(world: WorldData) -> dict[str, ProfilerRecord]:
-    """The joint methods on one world's scans and touches."""
+    """Return the joint methods on one world's scans and touches."""
     data = world.trial.data
     affine = sphere_joint(data, "affine", world.sigmas)
     joints = sphere_joint(data, "affine+joints", world.sigmas, init=affine)
@@ -242,7 +242,7 @@ def joint_records(world: WorldData) -> dict[str, ProfilerRecord]:
 
 
 def measure(k: int, world: WorldData) -> list[WorldResult]:
-    """All methods on one world."""
+    """Return all methods on one world."""
     features = seam_features(world)
     return [measured(k, method, record, world, features) for method, record in calibrations(world).items()]
 
@@ -286,7 +286,7 @@ def _off(record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: F
 
 
 def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:
-    """A frustum's profiles (n, m, 2) m as points in B by a calibration, (k, 3) m."""
+    """Return a frustum's profiles (n, m, 2) m as points in B by a calibration, (k, 3) m."""
     X = _flange(record, arm, q)
     parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
     return np.vstack(parts)

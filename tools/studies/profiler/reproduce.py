@@ -77,7 +77,7 @@ PUBLISHED = {SPHERE_METHODS[0]: 4.523, SPHERE_METHODS[1]: 0.840}
 
 
 def figure_text(value: float, unit: str) -> str:
-    """A figure with its unit: counts as whole numbers, tiny values as powers of ten."""
+    """Return a figure with its unit: counts as whole numbers, tiny values as powers of ten."""
     if unit == "points" or unit.startswith("of "):
         return f"{value:.0f} {unit}"
     return (f"{value:.3f}" if value >= 5e-4 or value == 0.0 else f"{value:.1e}") + (f" {unit}" if unit else "")
@@ -98,7 +98,7 @@ def require_files(folder: Path) -> None:
 
 
 def fixed_lines(folder: Path, progress: Callable[[str, float], None]) -> list[Target]:
-    """Every target of the fixed files.
+    """Return every target of the fixed files.
 
     Raises:
         InputError: a file is not there.

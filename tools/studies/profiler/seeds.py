@@ -42,7 +42,7 @@ WORLDS, GROOVES, BOSSES = 8, 3, 2
 
 
 def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, object]:
-    """Every figure of a seed, or of the fixed files in the folder ``data``, with its Cramer-Rao bound.
+    """Return every figure of a seed, or of the fixed files in the folder ``data``, with its Cramer-Rao bound.
 
     Returns:
         values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in
@@ -132,7 +132,7 @@ def _rows(figures: Figures) -> Iterable[Row]:
 
 
 def over_seeds(results: Results) -> bytes:
-    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
+    """Return every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
     lines = _figures(results)["lines"]
     picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
     axes = picture.add_subplot()
@@ -215,7 +215,7 @@ DRAWS, BOSS_DRAWS = 300, 6
 
 
 def changed(e: SphereEstimate, x: Floats) -> SphereEstimate:
-    """The estimate with all its unknowns (39,) moved."""
+    """Return the estimate with all its unknowns (39,) moved."""
     assert e.tip is not None
     errors = ProfilerArmErrors.of(x[15:])
     return replace(
@@ -241,7 +241,7 @@ def _apart(e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floa
 def predicted_mm(
     e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats, rng: np.random.Generator
 ) -> float:
-    """Mean distance that points seen and touched will have, by the bound and by the noise of seeing them."""
+    """Return the mean distance that measured and touched points will have, by the bound and by the sensor's noise."""
     at, X = _apart(e, arm, q, seen, q_touch)
     steps = 1e-3 * np.sqrt(np.diag(e.whole))
     J = np.stack(

@@ -63,7 +63,7 @@ class Missed(NamedTuple):
 class StreamReport:
     """One stream.
 
-    `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself,
+    `fault` is empty where it went through to its end. `stops`: when in the run (s) the link stopped the arm by itself,
     and its reason, lived through with a new start.
     """
 
@@ -82,7 +82,7 @@ class StreamReport:
         return [Missed(float(times[k + 1] - times[0]), float(late[k])) for k in np.flatnonzero(late > MISSED_S)]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: milliseconds unless the key says otherwise.
+        """Return the JSON object: milliseconds unless the key says otherwise.
 
         command_period_ms: from one command to the next where the cell hands them over. echo_ms: from the worker's
         sending to its reading that the script on the controller has the number. command_to_motion_ms: from the
@@ -193,7 +193,7 @@ def _steps(seconds: float) -> PiecewisePolynomial:
 
 
 def one_transport(name: str) -> str:
-    """The option's value. Raises InputError for another."""
+    """Return the option's value. Raises InputError for another."""
     if name not in (NATIVE, UR_RTDE):
         raise InputError(f"--transport must be {NATIVE} or {UR_RTDE}, not '{name}'.")
     return name

@@ -80,7 +80,7 @@ def run_soak(
 
 
 def _drawn(rng: np.random.Generator) -> tuple[Happening | None, bool]:
-    """The next cycle's fault, or None, and whether it calibrates."""
+    """Return the next cycle's fault, or None, and whether it calibrates."""
     calibrates = bool(rng.random() < CALIBRATES)
     if rng.random() >= FAULTY:
         return None, calibrates
@@ -139,7 +139,7 @@ def _children(pid: int) -> list[int]:
 
 
 def _is_pythons_own(pid: int) -> bool:
-    """Whether it is the one process with which Python keeps count of shared memory, until its owner ends."""
+    """Return whether it is the one process with which Python keeps count of shared memory, until its owner ends."""
     try:
         return b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -264,7 +264,7 @@ TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
 
 
 def one_world(device: str, phase: str, seed: int, folder: str) -> Mapping[str, object]:
-    """Every fault of a device in a phase, one job each, in one world: rows of FAULT_COLUMNS."""
+    """Return every fault of a device in a phase, one job each, in one world: rows of FAULT_COLUMNS."""
     host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     with wired_world(Path(folder) / "world", host, seed, SEAM_MM, bridged=True) as world:
         return {"rows": [_row(world, Path(folder), seed, Happening(device, fault, phase)) for fault in FAULTS]}

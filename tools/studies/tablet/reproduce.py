@@ -160,7 +160,7 @@ def median_seconds(work: Callable[[], object], repeats: int) -> float:
 
 
 def dh_by_eq_20(touches: TabletTouches) -> dict[str, Fitness]:
-    """The printed DH parameters under Eq. 20 as written and as computed, and the optimum of the written one."""
+    """Return the printed DH parameters under Eq. 20 as written and as computed, and the optimum of the written one."""
     x = STAGE_1["dh"].parameters
     return {
         "printed parameters, translation added to the error": fitness(stage1_residuals(touches, x, "dh", Sign.PRINTED)),
@@ -344,7 +344,7 @@ def tablet(
 
 
 def run_study(seed: int, evolution_seeds: int, trials: int, progress: Progress, more: Figures) -> Study:
-    """The study with all that it computed; its JSON object ends with ``more``."""
+    """Return the study with all that it computed; its JSON object ends with ``more``."""
     start = time.monotonic()
     touches = published_touches()
     progress("tables 7, 8, 10, 11", 0.0)
@@ -434,7 +434,7 @@ def _tables(figures: Figures, stages: Iterable[Reproduced]) -> Iterable[Table]:
 
 
 def limit_words(target: Target) -> str:
-    """The bound in words, such as "at most 0.46"."""
+    """Return the bound in words, such as "at most 0.46"."""
     return _LIMIT_WORDS[target.bound] + target.wanted.removeprefix(target.bound).strip()
 
 

@@ -263,7 +263,7 @@ def hold_against(target: MetricTarget, cases: Iterable[CaseResult]) -> Reached:
 
 
 def measure_row(row: Row, results: dict[WeldCase, CaseResult]) -> RowResult:
-    """The row's table line from the results of its cases."""
+    """Return the row's table line from the results of its cases."""
     cases = tuple(results[case] for case in row.cases)
     return RowResult(row, cases, tuple(hold_against(t, cases) for t in row.targets))
 
@@ -275,7 +275,7 @@ def run_cases(
     progress: Progress,
     known: dict[WeldCase, CaseResult] | None = None,
 ) -> dict[WeldCase, CaseResult]:
-    """Every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
+    """Return every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
 
     What is `known` of the same seeds already is not run again.
     """

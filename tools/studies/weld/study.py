@@ -180,7 +180,7 @@ LAW_HEADER = (
 
 
 def table_lines(rows: Iterable[RowResult]) -> list[tuple[str, str, str, str, str, str, str]]:
-    """The target table as text: what, figure, target, mean, worst, whether met, and the worst run."""
+    """Return the target table as text: what, figure, target, mean, worst, whether met, and the worst run."""
     lines = []
     for row in rows:
         done = f"{row.completed} of {row.runs}"
@@ -246,7 +246,7 @@ _BENT_RAD = math.radians(1.0)  # a surface whose normal turns by less is flat
 
 
 def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
-    """The run for the pictures, over the true seam; angles only where the surface bends."""
+    """Return the run for the pictures, over the true seam; angles only where the surface bends."""
     phase = run.column("phase").astype(int)
     moving = np.flatnonzero((phase != PHASES.index(Phase.TOUCH)) & np.isfinite(run.column("n_d_dot_n_t")))
     keep = moving[::_EVERY]

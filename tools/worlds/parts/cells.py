@@ -62,7 +62,7 @@ class PartTrial:
 
     @classmethod
     def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> PartTrial:
-        """The trial by the source of the pose: a pose from the drawing must be nearer to the truth.
+        """Return the trial by the source of the pose: a pose from the drawing must be nearer to the truth.
 
         Raises InputError: an unknown refinement.
         """
@@ -74,7 +74,7 @@ class PartTrial:
         )
 
     def calibration(self) -> Mapping[str, object]:
-        """The keys of the scenario's calibration, besides the guess of the mounting."""
+        """Return the keys of the scenario's calibration, besides the guess of the mounting."""
         if self.refine == PLAIN:
             return {"required_error_mm": 0.15, "maximum_scans": 12}
         # As docs/calibration.md has it: an arm's errors show in scans of many orientations only.
@@ -119,7 +119,7 @@ def write_cell(part: MadePart, folder: Path, trial: PartTrial) -> Path:
 
 
 def lowest(part: MadePart) -> float:
-    """The least z of a part, mm."""
+    """Return the least z of a part, mm."""
     from OCP.Bnd import Bnd_Box
     from OCP.BRepBndLib import BRepBndLib
 

@@ -41,13 +41,13 @@ class Scene:
 
 
 def box(length: float, width: float, height: float) -> TriMesh:
-    """A box that rests on z = 0, m."""
+    """Return a box that rests on z = 0, m."""
     corners = 0.5 * np.array([(-length, -width), (length, -width), (length, width), (-length, width)])
     return extrude(corners, 0.0, height)
 
 
 def table() -> TriMesh:
-    """A table whose top is z = 0."""
+    """Return a table whose top is z = 0."""
     return box(TABLE_M, TABLE_M, 0.02).transformed(RigidTransform([0.6, 0.0, -0.02]))
 
 
@@ -97,7 +97,7 @@ def scan_part(
     spread_m: float = 0.06,
     others: Sequence[TriMesh] = (),
 ) -> Scene:
-    """A part in a random place and turn under a scanner that hangs roughly above it.
+    """Return a part in a random place and turn under a scanner that hangs roughly above it.
 
     Everything random, the scanner's place and noise included, follows from the seed.
     """
@@ -125,7 +125,7 @@ CORNER_M, BEND_M = 0.004, 0.200
 
 
 def part_for(preset: str, shape: str) -> Workpiece:
-    """A workpiece that the preset's field of view holds in any turn."""
+    """Return a workpiece that the preset's field of view holds in any turn."""
     scanner = get_scanner(preset)
     small = min(scanner.footprint_m(min(0.93, 0.97 * scanner.far_m))) < 0.35
     kind = {"corner": "l", "bent": "s"}.get(shape, shape)
@@ -366,7 +366,7 @@ def scan_scene(
     in_vice: bool = False,
     twice: bool = False,
 ) -> PartScene:
-    """A part among clutter under a scanner that hangs roughly above it; everything random follows from the seed.
+    """Return a part among clutter under a scanner that hangs roughly above it; everything random follows from the seed.
 
     spots: round holes in the scan of the part; twice: an equal part lies beside it.
     """
@@ -391,7 +391,7 @@ def scan_scene(
 
 
 def block() -> TriMesh:
-    """A casting-like block of five boxes of unequal size: no turn maps it to itself."""
+    """Return a casting-like block of five boxes of unequal size: no turn maps it to itself."""
     parts = [
         box(0.14, 0.09, 0.02),
         box(0.05, 0.04, 0.07).transformed(RigidTransform([-0.035, 0.018, 0.0])),
@@ -434,13 +434,13 @@ class RefusedScene:
 
 
 def sphere(radius: float) -> TriMesh:
-    """A ball that rests on z = 0, m."""
+    """Return a ball that rests on z = 0, m."""
     a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
     return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
 
 
 def pipe(radius: float, wall: float, height: float) -> TriMesh:
-    """A pipe that rests on z = 0, m."""
+    """Return a pipe that rests on z = 0, m."""
     inner = radius - wall
     return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
 

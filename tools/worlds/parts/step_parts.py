@@ -67,7 +67,7 @@ def write_step(shape: Any, path: Path, unit: str = "MM") -> None:
 
 
 def box(low: Sequence[float], size: Sequence[float]) -> Any:
-    """A box from its lowest corner, mm."""
+    """Return a box from its lowest corner, mm."""
     from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
     from OCP.gp import gp_Pnt
 
@@ -75,7 +75,7 @@ def box(low: Sequence[float], size: Sequence[float]) -> Any:
 
 
 def prism(corners: Sequence[Sequence[float]], along: Sequence[float]) -> Any:
-    """A polygon (N,3) mm moved along a vector."""
+    """Return a polygon (N,3) mm moved along a vector."""
     from OCP.BRepPrimAPI import BRepPrimAPI_MakePrism
     from OCP.gp import gp_Vec
 
@@ -83,7 +83,7 @@ def prism(corners: Sequence[Sequence[float]], along: Sequence[float]) -> Any:
 
 
 def turned(corners: Sequence[Sequence[float]], point: Sequence[float], axis: Sequence[float], angle_rad: float) -> Any:
-    """A polygon (N,3) mm turned about an axis."""
+    """Return a polygon (N,3) mm turned about an axis."""
     from OCP.BRepPrimAPI import BRepPrimAPI_MakeRevol
     from OCP.gp import gp_Ax1, gp_Dir, gp_Pnt
 
@@ -91,7 +91,7 @@ def turned(corners: Sequence[Sequence[float]], point: Sequence[float], axis: Seq
 
 
 def cylinder(foot: Sequence[float], radius: float, height: float, axis: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
-    """A cylinder, mm."""
+    """Return a cylinder, mm."""
     from OCP.BRepPrimAPI import BRepPrimAPI_MakeCylinder
     from OCP.gp import gp_Ax2, gp_Dir, gp_Pnt
 
@@ -111,7 +111,7 @@ def fused(first: Any, *others: Any) -> Any:
 
 
 def less(first: Any, *others: Any) -> Any:
-    """A solid without others."""
+    """Return a solid without others."""
     from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
 
     for other in others:
@@ -152,7 +152,7 @@ def _arc(radius: float, low: float, high: float, z: float, step_mm: float = 5.0)
 
 
 def grooved_plate() -> MadePart:
-    """A plate with a V groove of 45 deg, 8 mm deep."""
+    """Return a plate with a V groove of 45 deg, 8 mm deep."""
     w = 8.0 * math.tan(math.radians(22.5))
     groove = prism([(-101, -w * 1.25, 2), (-101, w * 1.25, 2), (-101, 0, -8)], (202, 0, 0))
     shape = less(box((-100, -60, -20), (200, 120, 20)), groove)
@@ -167,7 +167,7 @@ def grooved_plate() -> MadePart:
 
 
 def curved_groove() -> MadePart:
-    """A plate with a V groove of 60 deg along an arc of radius 150 mm."""
+    """Return a plate with a V groove of 60 deg along an arc of radius 150 mm."""
     r, w = 150.0, 10.0 * math.tan(math.radians(30.0))
     ring = turned([(r - w, 0, 2), (r + w, 0, 2), (r, 0, -8)], (0, 0, 0), (0, 0, 1), 2.0 * math.pi)
     shape = less(box((90, -90, -20), (100, 180, 20)), ring)
@@ -183,7 +183,7 @@ def curved_groove() -> MadePart:
 
 
 def pipe_on_plate() -> MadePart:
-    """A pipe of 160 mm on a plate; the seam is a third of its foot."""
+    """Return a pipe of 160 mm on a plate; the seam is a third of its foot."""
     pipe = less(cylinder((0, 0, -1), 80.0, 61.0), cylinder((0, 0, -2), 72.0, 70.0))
     shape = fused(box((-120, -120, -12), (240, 240, 12)), pipe)
     line = _arc(80.0, math.radians(-150.0), math.radians(-30.0), 0.0)
@@ -203,14 +203,14 @@ def box_corner() -> MadePart:
 
 
 def bracket() -> MadePart:
-    """An angle bracket with two holes and a gusset beyond the seam's end."""
+    """Return an angle bracket with two holes and a gusset beyond the seam's end."""
     shape = fused(box((-80, -50, -10), (160, 100, 10)), box((-80, 20, 0), (160, 10, 60)))
     shape = less(shape, cylinder((-40, -25, -20), 8.0, 40.0), cylinder((40, -25, -20), 8.0, 40.0))
     return MadePart(name="bracket", shape=shape, line_mm=_straight((-80, 20, 0), (80, 20, 0)), length_mm=160.0)
 
 
 def bent_sheet() -> MadePart:
-    """A sheet bent over a radius of 300 mm with a straight web across it: the seam bends in the web's plane."""
+    """Return a sheet bent over a radius of 300 mm with a straight web across it: the seam bends in the web's plane."""
     half = math.asin(90.0 / 300.0)
     sheet = turned(
         [
@@ -233,19 +233,19 @@ def bent_sheet() -> MadePart:
 
 
 def lap() -> MadePart:
-    """A sheet of 6 mm on another: the seam runs along the upper sheet's edge."""
+    """Return a sheet of 6 mm on another: the seam runs along the upper sheet's edge."""
     shape = assembly(box((-100, -80, -6), (200, 100, 6)), box((-100, 0, 0), (200, 80, 6)))
     return MadePart(name="lap", shape=shape, joint="lap", line_mm=_straight((-100, 0, 0), (100, 0, 0)), length_mm=200.0)
 
 
 def straight_web() -> MadePart:
-    """A T of a plate and a web of 10 mm, one solid."""
+    """Return a T of a plate and a web of 10 mm, one solid."""
     shape = fused(box((-100, -60, -10), (200, 120, 10)), box((-100, -5, 0), (200, 10, 50)))
     return MadePart(name="straight_web", shape=shape, line_mm=_straight((-100, -5, 0), (100, -5, 0)), length_mm=200.0)
 
 
 def curved_web() -> MadePart:
-    """A T whose web follows an arc of radius 200 mm; the seam lies on its outside."""
+    """Return a T whose web follows an arc of radius 200 mm; the seam lies on its outside."""
     half = math.radians(25.0)
     web = turned([(190, 0, -1), (200, 0, -1), (200, 0, 45), (190, 0, 45)], (0, 0, 0), (0, 0, 1), 2.0 * half)
     shape = fused(box((130, -100, -10), (120, 200, 10)), turned_about_z(web, -half))
@@ -268,7 +268,7 @@ def butt() -> MadePart:
 
 
 def two_solids() -> MadePart:
-    """A T as an assembly: the web rests on the plate as a body of its own."""
+    """Return a T as an assembly: the web rests on the plate as a body of its own."""
     shape = assembly(box((-90, -60, -10), (180, 120, 10)), box((-90, 0, 0), (180, 8, 60)))
     return MadePart(name="two_solids", shape=shape, line_mm=_straight((-90, 0, 0), (90, 0, 0)), length_mm=180.0)
 
@@ -291,7 +291,7 @@ def bevelled_plates() -> MadePart:
 
 
 def moved(shape: Any, by: Sequence[float]) -> Any:
-    """A shape moved by a vector, mm."""
+    """Return a shape moved by a vector, mm."""
     from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
     from OCP.gp import gp_Trsf, gp_Vec
 
@@ -301,7 +301,7 @@ def moved(shape: Any, by: Sequence[float]) -> Any:
 
 
 def turned_about_z(shape: Any, angle_rad: float) -> Any:
-    """A shape turned about the z axis."""
+    """Return a shape turned about the z axis."""
     from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
     from OCP.gp import gp_Ax1, gp_Dir, gp_Pnt, gp_Trsf
 

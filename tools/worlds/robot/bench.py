@@ -248,7 +248,7 @@ class Bench:
         return float(np.linalg.norm(self.emulator.state()["tcp_speed"][:3]))
 
     def at_rest_after(self, fault_time: float, within_s: float) -> dict[str, float | bool | None]:
-        """The checker's answer."""
+        """Return the checker's answer."""
         return self.emulator.ask(check="at_rest_after", fault_time=fault_time, within=within_s)
 
     def press_play(self) -> str:

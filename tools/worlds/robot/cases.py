@@ -101,7 +101,7 @@ def _stands_still(seconds: float) -> Callable[[Bench], float]:
 
 
 def _slider(percent: int) -> Callable[[Bench], float]:
-    """The slider alone: the scaling that a controller reports beside it stays at 100 %."""
+    """Return the slider alone: the scaling that a controller reports beside it stays at 100 %."""
     return _fault("speed_scaling", value=0.01 * percent)
 
 
@@ -132,7 +132,7 @@ def _stops(
     short: bool = True,
     **settings: Any,
 ) -> FaultCase:
-    """A fault that must stop the arm and be reported as one of these."""
+    """Return a fault that must stop the arm and be reported as one of these."""
     named = frozenset({faults}) if isinstance(faults, Fault) else faults
     return FaultCase(name=name, throw=throw, must=STOP, faults=named, repair=repair, short=short, **settings)
 
@@ -145,12 +145,12 @@ def _paused(name: str, throw: Callable[[Bench], float], play_s: float, *, short:
 def _either(
     name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: RepairStep, short: bool = True
 ) -> FaultCase:
-    """A fault in which the arm may go on, or stop and report one of these."""
+    """Return a fault in which the arm may go on, or stop and report one of these."""
     return FaultCase(name=name, throw=throw, must=GO_OR_STOP, faults=frozenset(faults), repair=repair, short=short)
 
 
 def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bool = True) -> FaultCase:
-    """A state of the controller in which a start must be refused with a sentence that contains `says`."""
+    """Return a state of the controller in which a start must be refused with a sentence that contains `says`."""
     return FaultCase(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
 
 
@@ -169,7 +169,7 @@ SHORT_NUMBERS = ("nan as actual_q", "inf as actual_TCP_pose", "nan as speed_scal
 
 
 def _no_number(output: str, value: str, **settings: Any) -> FaultCase:
-    """An output of real numbers that is not a finite number."""
+    """Return an output of real numbers that is not a finite number."""
     name, throw = f"{value} as {output}", _fault("wrong_number", output=output, value=float(value))
     named = name in SHORT_NUMBERS
     return _stops(name, throw, Fault.STATE_NOT_FINITE, CLEAR, **({"random": named, "short": named} | settings))

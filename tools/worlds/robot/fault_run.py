@@ -121,7 +121,7 @@ def _running(bench: Bench, case: FaultCase, hasty: bool) -> FaultOutcome:
 
 
 def _speed_of_the_way(bench: Bench) -> float:
-    """The tool's speed; on a busy computer the arm may be in one of its turns by now, which take 0.2 s."""
+    """Return the tool's speed; on a busy computer the arm may be in one of its turns by now, which take 0.2 s."""
     until = time.monotonic() + TURN_S
     while abs((speed := bench.tool_speed()) - SPEED_M_S) >= _SPEED_OFF and time.monotonic() < until:
         time.sleep(0.01)

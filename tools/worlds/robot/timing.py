@@ -27,7 +27,7 @@ STEP_JOINT = 5
 
 @dataclass(kw_only=True)
 class Tap:
-    """Stands between the arm's LeafSystem and its link, and notes when what passes.
+    """Sit between the arm's LeafSystem and its link, and record when what passes.
 
     Times in s of the monotonic clock.
     """
@@ -122,7 +122,7 @@ class HostLateness:
         return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 
     def summary(self) -> dict[str, object]:
-        """The JSON object."""
+        """Return the JSON object."""
         late = self.lateness
         found = {"wake_ups": sum(late.counts), "under_4_ms_percent": late.on_time_percent, "over_8_ms": late.over(8.0)}
         return {**found, "worst_ms": late.worst_ms, "histogram": list(late.counts), "precedence": self.precedence}

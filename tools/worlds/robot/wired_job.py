@@ -60,7 +60,7 @@ class Happening:
 
     @property
     def silent(self) -> bool:
-        """Tell whether no signal of the device differs from that of a sound one until the job ends.
+        """Return whether no signal of the device differs from that of a sound one until the job ends.
 
         The job must then be done, and right.
 

@@ -67,12 +67,12 @@ class WeldUnknowns:
         )
 
     def lag_s(self, budget_s: float, believed_s: float) -> float:
-        """The robot's lag: the budget's, or a share of the servo's own."""
+        """Return the robot's lag: the budget's, or a share of the servo's own."""
         return budget_s if math.isnan(self.lag_share) else self.lag_share * believed_s
 
 
 def draw_world(unknowns: Unknowns, seed: int) -> WeldUnknowns:
-    """The world of a seed, from a generator of its own: the other errors of a run do not change with it."""
+    """Return the world of a seed, from a generator of its own: the other errors of a run do not change with it."""
     rng = np.random.default_rng((seed, 1))
     ranges = zip((field.name for field in fields(WeldUnknowns)), astuple(unknowns), strict=True)
     return WeldUnknowns(**{name: math.nan if r is None else float(rng.uniform(*r)) for name, r in ranges})

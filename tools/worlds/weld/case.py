@@ -78,7 +78,7 @@ def judge(
     gaps: tuple[tuple[float, float], ...] = (),
     deflection_m: float = 2.0e-3,
 ) -> RunMetrics:
-    """The figures of a run.
+    """Return the figures of a run.
 
     Args:
         weld_speed_m_s: wanted torch speed; chord_m: |d|; gaps: (from, to) m of the true seam; deflection_m: delta_d.
@@ -248,7 +248,7 @@ class CellRun:
 
 
 def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: float) -> CellRun:
-    """The figures of a finished run, in mm."""
+    """Return the figures of a finished run, in mm."""
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
     if weld is None or weld.error is None or weld.speed is None or felt is None:

@@ -55,7 +55,7 @@ class Wedge:
         return self.half_width_m - self.radius_m * math.cos(self.half_angle_rad)
 
     def seat_line(self, root: SeamCurve) -> SeamCurve:
-        """The line of the seated tip's centre above a root line."""
+        """Return the line of the seated tip's centre above a root line."""
         return root.raised(self.seat_m * math.cos(self.tilt_rad), self.seat_m * math.sin(self.tilt_rad))
 
     def floor(self, y: float) -> tuple[float, float]:
@@ -90,7 +90,7 @@ class Groove:
     wedge: Wedge = DRAWN
 
     def present(self, s: float) -> bool:
-        """Whether there is work under the tip at arc length s m."""
+        """Return whether there is work under the tip at arc length s m."""
         return 0.0 <= s <= self.line.length and not any(a < s < b for a, b in self.gaps)
 
 
@@ -109,8 +109,8 @@ class TipPlace:
     def step(self, rest: Array, dt: float) -> Array:
         """Move for dt s towards balance with the spring's rest point (3,) m; the centre (3,) m.
 
-        Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge;
-        across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
+        Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge.
+        Across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
         """
         groove, line, wedge = self._groove, self._groove.line, self._wedge
         r0, r1, r2 = rest.tolist()

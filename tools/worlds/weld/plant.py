@@ -54,7 +54,7 @@ class Stamps:
         return stamp
 
     def picture(self, taken: DeflectionSample) -> DeflectionSample:
-        """The picture with its stamp, and with the pose that the poses' stamps give for that time.
+        """Return the picture with its stamp, and with the pose that the poses' stamps give for that time.
 
         `pose` comes first.
         """
@@ -123,7 +123,7 @@ class StudyRun:
 
 
 def groove_config(config: ServoConfig) -> ServoConfig:
-    """The settings with the drawn groove in them: seat and drop that a new tip would have there."""
+    """Return the settings with the drawn groove in them: seat and drop that a new tip would have there."""
     return replace(config, tool=replace(config.tool, tip_seat_height_m=SEAT_M, tip_drop_m=DROP_M))
 
 
@@ -210,7 +210,7 @@ def simulate(
 
 
 def _lost(line: SeamCurve, p: Array, s_near: float) -> bool:
-    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included.
+    """Return whether p (3,) m is more than 60 mm off a line, its straight extensions included.
 
     At s_near m it is probably not.
     """
@@ -220,7 +220,7 @@ def _lost(line: SeamCurve, p: Array, s_near: float) -> bool:
 
 
 def _turned(R: Array, turn: Array, tick: int) -> Array:
-    """The rotation matrix after a small turn vector (3,) rad, made orthonormal every 50 ticks."""
+    """Return the rotation matrix after a small turn vector (3,) rad, made orthonormal every 50 ticks."""
     x, y, z = turn.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-12:

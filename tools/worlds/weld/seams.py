@@ -51,7 +51,7 @@ def corner(radius: float, turn_deg: float, side: float, legs: float | None = Non
 
 
 def s_curve(radius: float = 0.060, turn: float = math.radians(60.0)) -> Array:
-    """An S of 300 mm: straight, left, right, left, right, straight."""
+    """Return an S of 300 mm: straight, left, right, left, right, straight."""
     bend = radius * turn
     rest = 0.5 * (LENGTH_M - 3.0 * bend)
     k = 1.0 / radius
@@ -59,7 +59,7 @@ def s_curve(radius: float = 0.060, turn: float = math.radians(60.0)) -> Array:
 
 
 def on_cylinder(flat: Array, radius: float) -> tuple[Array, Array]:
-    """A flat curve (N,3) wrapped on a cylinder of that radius m with its axis along y, and the normals (N,3)."""
+    """Return a flat curve (N,3) wrapped on a cylinder of that radius m with its axis along y, and the normals (N,3)."""
     a = (flat[:, 0] - flat[:, 0].mean()) / radius
     up = np.column_stack([np.sin(a), 0.0 * a, np.cos(a)])
     return np.column_stack([radius * np.sin(a), flat[:, 1], radius * np.cos(a) - radius]), up
@@ -100,7 +100,7 @@ NAMES = (*_FLAT, "s_r60_on_r300", "s_r60_on_r150", "l_r20_on_r300", "l_r20_on_r1
 
 
 def get_seam(name: str) -> TrueSeam:
-    """The seam of that name; `<flat>_on_r<mm>` is a flat one wrapped on a cylinder. Left turns are convex.
+    """Return the seam of that name; `<flat>_on_r<mm>` is a flat one wrapped on a cylinder. Left turns are convex.
 
     The tip leans on the wall to its left, as in the paper: a left turn leads round the outside of that wall's corner.
 

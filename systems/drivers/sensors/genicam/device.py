@@ -67,7 +67,7 @@ class GenicamKeys:
     settings: dict[str, str] = field(default_factory=dict)  # features by name, over those of the profile
 
     def title(self, kind: str) -> str:
-        """The device's name at the beginning of a sentence."""
+        """Return the device's name at the beginning of a sentence."""
         return f"The {kind} {self.device or self.profile} (GenICam)"
 
 
@@ -131,7 +131,7 @@ class GenicamDevice:
             raise
 
     def take(self, timeout_s: float) -> CopiedFrame | None:
-        """The oldest frame that waits; None where none came in time.
+        """Return the oldest frame that waits; None where none came in time.
 
         Raises DeviceLost, and Garbage for an empty one.
         """
@@ -164,7 +164,7 @@ class GenicamDevice:
             raise DeviceLost(f"its command {command} failed ({error})") from error
 
     def read(self, feature: str) -> Any:
-        """The value of a feature; None where the device has none of this name."""
+        """Return the value of a feature; None where the device has none of this name."""
         try:
             return self.nodes.get_node(feature).value
         except Exception:  # the producers' bindings raise types of their own, of no common base
@@ -244,7 +244,7 @@ class GenicamSource(Source[Datum]):
 
     @abstractmethod
     def datum(self, components: tuple[Component, ...]) -> Datum:
-        """The datum of a frame's components. Raises Garbage."""
+        """Return the datum of a frame's components. Raises Garbage."""
 
     def open(self) -> None:
         """See Source."""
@@ -297,20 +297,20 @@ class DeviceProfile:
     unit: str = "device"
 
     def features(self, *, streams: bool, own: dict[str, str]) -> dict[str, str]:
-        """Every feature to write, in order; the scenario's own replace those of the profile."""
+        """Return every feature to write, in order; the scenario's own replace those of the profile."""
         return {**self.settings, **(self.stream if streams else self.scans), **own}
 
 
 @cache
 def profiles() -> dict[str, DeviceProfile]:
-    """All profiles by name."""
+    """Return all profiles by name."""
     with as_file(files(__package__).joinpath("profiles.yaml")) as path:
         document = read_document(path)
     return {name: replace(DeviceProfile(), **keys) for name, keys in document.items()}
 
 
 def get_profile(name: str) -> DeviceProfile:
-    """The named profile; raises InputError naming the known ones."""
+    """Return the named profile; raises InputError naming the known ones."""
     found = profiles().get(name)
     if found is None:
         raise InputError(f"There is no GenICam profile '{name}': use one of {', '.join(profiles())}.")
@@ -346,7 +346,7 @@ def cloud_of(parts: Sequence[Component]) -> NDArray[np.float32]:
 
 
 def profile_of(parts: Sequence[Component], scaling: Scaling = UNIT_SCALING) -> NDArray[np.float64]:
-    """The last line of a frame as points (W, 2) [x, z] in the device's unit, NaN where nothing was measured.
+    """Return the last line of a frame as points (W, 2) [x, z] in the device's unit, NaN where nothing was measured.
 
     Of Coord3D_AC32f, Coord3D_ABC32f or its planes as they are; of the range Coord3D_C16, whose x is the column, by
     `scaling`.
@@ -366,7 +366,7 @@ def profile_of(parts: Sequence[Component], scaling: Scaling = UNIT_SCALING) -> N
 
 
 def picture_of(parts: Sequence[Component]) -> NDArray[np.uint8]:
-    """The first picture of a frame in grey (H, W), 8 bits.
+    """Return the first picture of a frame in grey (H, W), 8 bits.
 
     Raises:
         Garbage: the frame has no picture in a known pixel format.

@@ -28,7 +28,7 @@ class GenicamFingerCamera(GenicamKeys, WiredFingerCamera):
     """`!GenicamFingerCamera`: the maker's GenTL producer, device and features; `exposure_ms` sets ExposureTime."""
 
     def source(self) -> Source[Picture]:
-        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        """Return the device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamPictures(self)  # the keys are checked here, not in the process
         return SourceProcess(self.title("finger camera"), GenicamPictures, self)
 

@@ -39,7 +39,7 @@ class GenicamProfiler(GenicamKeys, WiredProfiler):
     unit: str = "device"
 
     def source(self) -> Source[Profile]:
-        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        """Return the device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamProfiles(self)  # the keys are checked here, not in the process
         return SourceProcess(self.title("profiler"), GenicamProfiles, self)
 

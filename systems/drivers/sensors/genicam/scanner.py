@@ -37,7 +37,7 @@ class GenicamScanner(GenicamKeys, WiredScanner):
         return {"m": 1.0, "mm": 1e-3}.get(unit, GENICAM_UNIT_M)
 
     def source(self) -> Source[Cloud]:
-        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        """Return the device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamClouds(self)  # the keys are checked here, not in the process
         return SourceProcess(self.title("scanner"), GenicamClouds, self)
 

@@ -88,7 +88,7 @@ def read_kinematics(
 
 
 def _part(package: bytes, wanted: int, line: SocketLine) -> bytes | None:
-    """The body of one sub-package of a robot state; None where the state does not contain it."""
+    """Return the body of one sub-package of a robot state; None where the state does not contain it."""
     at = 0
     while at + _PART.size <= len(package):
         size, kind = _PART.unpack_from(package, at)
@@ -130,7 +130,7 @@ def _limits(body: bytes | None) -> JointLimits | None:
 
 
 def limited_arm(arm: ArmModel, limits: JointLimits | None) -> ArmModel:
-    """The arm within its own limits and those that the controller reports; the same where that reports none.
+    """Return the arm within its own limits and those that the controller reports; the same where that reports none.
 
     Raises:
         InputError: the two leave a joint nothing.
@@ -148,7 +148,7 @@ def limited_arm(arm: ArmModel, limits: JointLimits | None) -> ArmModel:
 
 
 def model_finding(told: str, wanted: str) -> tuple[bool, str, str]:
-    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm.
+    """Return whether the controller's name of its arm, such as UR10, fits the scenario's arm.
 
     What was found; the operator action.
     """

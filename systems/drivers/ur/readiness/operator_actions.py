@@ -61,7 +61,7 @@ _ON_START = f"{_INITIALIZE}, then ON, then START"
 
 
 def power(robot_mode: int) -> str:
-    """The operator action where the arm is not RUNNING."""
+    """Return the operator action where the arm is not RUNNING."""
     match robot_mode:
         case 1:
             return "The safety configuration is not confirmed: confirm it in the pop-up on the pendant."
@@ -77,7 +77,7 @@ def power(robot_mode: int) -> str:
 
 
 def safety(safety_mode: int) -> str:
-    """The operator action where the safety system has stopped the arm."""
+    """Return the operator action where the safety system has stopped the arm."""
     match safety_mode:
         case 3:
             return (
@@ -115,7 +115,7 @@ def outputs(missing: list[str]) -> str:
 
 
 def payload(owner: str, text: str) -> str:
-    """The operator action where the payload is not the expected one."""
+    """Return the operator action where the payload is not the expected one."""
     return (
         f"The payload is not that of {owner}: set {text} under Installation > General > Payload on the pendant and save"
         " the installation, or give what hangs on the flange as payload_kg and payload_cog_m in the scenario."
@@ -123,7 +123,7 @@ def payload(owner: str, text: str) -> str:
 
 
 def mounting(wanted: str) -> str:
-    """The operator action where the robot is mounted in another way than in the scenario."""
+    """Return the operator action where the robot's mounting is not the scenario's."""
     return (
         "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the"
         f" pendant, or correct base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."
@@ -131,7 +131,7 @@ def mounting(wanted: str) -> str:
 
 
 def model(told: str, wanted: str) -> str:
-    """The operator action where the controller's arm is another model than the scenario's."""
+    """Return the operator action where the controller's arm is another model than the scenario's."""
     return (
         f"The controller says that its arm is a {told}, and the scenario's is a {wanted}: connect a {wanted}, or write"
         " this robot's arm in the scenario as arm."
@@ -139,7 +139,7 @@ def model(told: str, wanted: str) -> str:
 
 
 def limits(joint: str) -> str:
-    """The operator action where a joint is too near its limit."""
+    """Return the operator action where a joint is too near its limit."""
     return (
         f"The {joint} joint is less than 5 degrees from its limit, or beyond it: turn it back with the Move tab of the"
         " pendant."
@@ -147,7 +147,7 @@ def limits(joint: str) -> str:
 
 
 def program(state: str, name: str) -> str:
-    """The operator action where another program runs or is paused."""
+    """Return the operator action where another program runs or is paused."""
     which = f"the program {name}" if name and not name.startswith("<") else "a program"
     return (
         f"The robot is busy with {which} ({state}): press Stop at the bottom of the pendant's screen; weldcal "

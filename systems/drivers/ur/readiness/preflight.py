@@ -52,7 +52,7 @@ OLDEST_5, OLDEST_X = (5, 12), (10, 10)
 
 
 def is_supported(version: tuple[int, ...]) -> bool:
-    """Whether it is PolyScope 5.12 or newer, or PolyScope X 10.10 or newer."""
+    """Return whether it is PolyScope 5.12 or newer, or PolyScope X 10.10 or newer."""
     return OLDEST_X <= version[:2] < (11, 0) or OLDEST_5 <= version[:2] < (6, 0)
 
 
@@ -205,14 +205,14 @@ class _Look:
         self._dashboard = True
 
     def report(self) -> Preflight:
-        """All checks in their order, including those not made."""
+        """Return all checks in their order, including those not made."""
         found = self._found
         found.checks = tuple(self._done.get(name) or self._waiting(name) for name in CHECKS)
         found.arm_q, found.tcp_pose, found.tcp_offset = map(self._six, ("actual_q", "actual_TCP_pose", "tcp_offset"))
         return found
 
     def _waiting(self, name: str) -> Check:
-        """A check that could not be made, with the check that must pass first."""
+        """Return a check that could not be made, with the check that must pass first."""
         blockers = ("answer", "version", *WAITS_FOR.get(name, ()))
         first = next(blocker for blocker in blockers if blocker in self._done and not self._done[blocker].ok)
         return Check(name, False, f"needs {first}", checked=False)
@@ -359,7 +359,7 @@ class _Look:
         self._ok("registers", f"{ranges(list(claims))} free{stale}")
 
     def _check_model(self) -> None:
-        """Whether the controller's arm is the scenario's, as far as their names tell them apart."""
+        """Check that the controller's arm is the scenario's, as far as their names differ."""
         wanted = self._nominal.name
         if self._is_x():
             self._ok("model", "not readable on PolyScope X; the kinematics tell")
@@ -416,7 +416,7 @@ class _Look:
         self._state("remote control", told == "true", "on" if told == "true" else "local control", actions.LOCAL)
 
     def _ask(self, command: str) -> str:
-        """The dashboard's answer; LOCAL where it refuses because the robot is in local control."""
+        """Return the dashboard's answer; LOCAL where it refuses because the robot is in local control."""
         answer = ask(self._found.host, command, self._timeout_s)
         return LOCAL if "remote control mode" in answer.lower() else answer
 

@@ -57,7 +57,7 @@ class SocketLine:
             raise self._lost("accepts no data") from error
 
     def deadline(self) -> float:
-        """The time at which a call that starts now must end (s, monotonic)."""
+        """Return the time at which a call that starts now must end (s, monotonic)."""
         return time.monotonic() + self._timeout_s
 
     def read(self, size: int, until: float) -> bytes:
@@ -85,11 +85,11 @@ class SocketLine:
                 pass
 
     def release(self) -> tuple[socket.socket, bytearray]:
-        """The connection and what has arrived of it, for a caller that reads without waiting."""
+        """Return the connection and what has arrived of it, for a caller that reads without waiting."""
         return self._socket, self._inbox
 
     def nonsense(self) -> RobotUnreachable:
-        """The exception for data that do not follow the protocol."""
+        """Return the exception for data that do not follow the protocol."""
         return RobotUnreachable(
             f"The server at {self._host} port {self._port} is not a UR controller: compare the address with the one on "
             "the pendant under Settings > System > Network."
@@ -149,7 +149,7 @@ def _resolve(host: str, port: int, timeout_s: float) -> tuple[str, int]:
 
 
 def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_PORT) -> str:
-    """The controller's answer to one dashboard command, such as `is in remote control`.
+    """Return the controller's answer to one dashboard command, such as `is in remote control`.
 
     Args:
         host: name or address of the controller.

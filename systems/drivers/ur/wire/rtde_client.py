@@ -186,7 +186,7 @@ class RtdeProbe:
 
 
 def package_layout(names: Sequence[str], kinds: Sequence[str]) -> tuple[struct.Struct, dict[str, slice | int]]:
-    """The layout of an output package, its recipe's number first, and each output's place among its numbers."""
+    """Return the layout of an output package, its recipe's number first, and each output's place among its numbers."""
     places: dict[str, slice | int] = {}
     at = 1
     for name, kind in zip(names, kinds, strict=True):

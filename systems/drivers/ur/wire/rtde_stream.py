@@ -72,7 +72,7 @@ class RtdeStream:
         return found
 
     def _finite(self, at: int) -> tuple[float, ...] | None:
-        """The package that begins there in the inbox; None where one of its numbers is not finite."""
+        """Return the package that begins there in the inbox; None where one of its numbers is not finite."""
         package = self._layout.unpack_from(self._inbox, at)
         if all(map(math.isfinite, package)):
             return package
@@ -120,13 +120,13 @@ class RtdeStream:
             self.wait(0.01)
 
     def number(self, name: str) -> float:
-        """An output in the newest package."""
+        """Return an output in the newest package."""
         at = self._at[name]
         assert isinstance(at, int)
         return self._package_now[at]
 
     def vector(self, name: str) -> tuple[float, ...]:
-        """An output of several numbers in the newest package."""
+        """Return an output of several numbers in the newest package."""
         at = self._at[name]
         assert isinstance(at, slice)
         return self._package_now[at]

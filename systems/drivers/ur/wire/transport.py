@@ -46,10 +46,10 @@ class Transport(Protocol):
         """Poll, after the next state or this time."""
 
     def number(self, name: str) -> float:
-        """An output in the newest state."""
+        """Return an output in the newest state."""
 
     def vector(self, name: str) -> tuple[float, ...]:
-        """An output of several numbers in the newest state."""
+        """Return an output of several numbers in the newest state."""
 
     def send(self, *values: float) -> None:
         """Write a command of the guard and its numbers."""
@@ -127,7 +127,7 @@ LIMITS: tuple[tuple[Callable[[Situation], bool], str], ...] = (
 
 
 def choose(wanted: str, found: Situation) -> tuple[str, str]:
-    """The transport, and why in a sentence.
+    """Return the transport, and why in a sentence.
 
     For `ur_rtde` that is wanted where it cannot be used, the first is `native`.
     """
@@ -143,7 +143,7 @@ def choose(wanted: str, found: Situation) -> tuple[str, str]:
 
 
 def installed() -> bool:
-    """Whether ur_rtde can be imported; it is imported in the worker process only."""
+    """Return whether ur_rtde can be imported; it is imported in the worker process only."""
     return find_spec("rtde_control") is not None
 
 

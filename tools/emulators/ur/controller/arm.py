@@ -64,7 +64,7 @@ class Task:
 
 
 class Compliance:
-    """The deviation under way."""
+    """Hold the current deviation."""
 
     def __init__(self, model: ArmModel, q: Array, qd: Array, p_FT: Array, task: Task) -> None:
         self.nominal = Nominal(model, q.copy(), qd.copy(), p_FT)
@@ -72,7 +72,7 @@ class Compliance:
         self._moved, self._turned, self._speed = np.zeros(3), np.eye(3), np.zeros(6)
 
     def velocity(self, q: Array, X_FT: Array, qd_nominal: Array, wrench: Array, live: bool) -> Array:
-        """Joint velocity (6) of the real arm at q for the next step; while it is not live the deviation stands still.
+        """Return the joint velocity (6) of the real arm at q for the next step; not live, the deviation is frozen.
 
         Raises:
             MotionRefused: the deviation leads out of reach.
@@ -101,13 +101,13 @@ class Compliance:
 def force_task(
     frame: list[float], selection: Array, wrench: Array, kind: int, limits: Array, gain_scaling: float
 ) -> Task:
-    """The task of one call of force_mode."""
+    """Return the task of one call of force_mode."""
     # for an axis that is not compliant the limit is a deviation, which this arm has none of
     return Task(matrix(frame), selection, wrench, kind, np.abs(limits), DAMPING / max(gain_scaling, 1e-3))
 
 
 def free_task(frame: list[float], free_axes: Array) -> Task:
-    """The task of freedrive: every free axis gives way to the hand."""
+    """Return the task of freedrive: every free axis follows the hand."""
     return Task(matrix(frame), free_axes, np.zeros(6), 2, FREE_LIMITS, FREE_DAMPING)
 
 
@@ -183,7 +183,7 @@ class ForceSensor:
 
 
 class EmulatedArm:
-    """Targets and actual values of six joints (rad, rad/s, rad/s^2), the tool frame, and the motion under way."""
+    """Hold targets and actual values of six joints (rad, rad/s, rad/s^2), the tool frame, and the current motion."""
 
     def __init__(self, model: ArmModel, q: Array) -> None:
         self.model = model
@@ -230,7 +230,7 @@ class EmulatedArm:
         return self if self.compliance is None else self.compliance.nominal
 
     def step(self, driven: bool, scaling: float, live: bool = True) -> None:
-        """Moves by one step; where it is not driven it brakes, and where it is not live force mode stands still.
+        """Move by one step; where it is not driven it brakes, and where it is not live force mode is frozen.
 
         Raises:
             MotionRefused: the arm cannot follow; it has begun to brake.
@@ -305,7 +305,7 @@ class EmulatedArm:
         return matrix(pose) @ inverse(self.X_FT)
 
     def tool_pose(self, target: bool = False) -> list[float]:
-        """The tool's pose in the base, from the actual or the target joints."""
+        """Return the tool's pose in the base, from the actual or the target joints."""
         cache = self._cache_of(target)
         if "pose" not in cache:
             R, p, _ = self._tool(cache, target)
@@ -313,7 +313,7 @@ class EmulatedArm:
         return list(cache["pose"])
 
     def tool_speed(self, target: bool = False) -> list[float]:
-        """The tool's twist [v; w] in base axes (m/s, rad/s)."""
+        """Return the tool's twist [v; w] in base axes (m/s, rad/s)."""
         qd = self.qd_target if target else self.qd
         if not qd.any():
             return [0.0] * 6

@@ -39,7 +39,7 @@ class ArmState(Protocol):
 
 
 class ControllerMotion(Protocol):
-    """A motion under way."""
+    """Hold a current motion."""
 
     streamed: bool
     done: bool
@@ -202,7 +202,7 @@ class Stop:
 
 
 def slowed(qd: Array, deceleration: float) -> Array:
-    """qd with its leading joint slowed by `deceleration` (rad/s^2) over one step, the direction kept."""
+    """Return qd with its leading joint slowed by `deceleration` (rad/s^2) over one step, in the same direction."""
     speed = float(np.abs(qd).max())
     if speed <= deceleration * STEP_S:
         return np.zeros(6)

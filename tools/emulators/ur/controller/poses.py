@@ -60,7 +60,7 @@ def rotation_vector(R: Array) -> Array:
 
 
 def matrix(pose: Sequence[float] | Array) -> Array:
-    """The homogeneous matrix (4, 4) of a pose."""
+    """Return the homogeneous matrix (4, 4) of a pose."""
     X = np.eye(4)
     X[:3, :3] = rotation_matrix(pose[3:6])
     X[:3, 3] = pose[:3]
@@ -68,12 +68,12 @@ def matrix(pose: Sequence[float] | Array) -> Array:
 
 
 def pose_of(X: Array) -> list[float]:
-    """The pose of a homogeneous matrix (4, 4)."""
+    """Return the pose of a homogeneous matrix (4, 4)."""
     return [*X[:3, 3].tolist(), *rotation_vector(X[:3, :3]).tolist()]
 
 
 def inverse(X: Array) -> Array:
-    """The inverse of a rigid homogeneous matrix."""
+    """Return the inverse of a rigid homogeneous matrix."""
     out = np.eye(4)
     out[:3, :3] = X[:3, :3].T
     out[:3, 3] = -X[:3, :3].T @ X[:3, 3]
@@ -81,7 +81,7 @@ def inverse(X: Array) -> Array:
 
 
 def pose_error(X_goal: Array, R: Array, p: Array) -> Array:
-    """The twist [omega; v] that takes (R, p) to X_goal in one unit of time, in base axes."""
+    """Return the twist [omega; v] that takes (R, p) to X_goal in one unit of time, in base axes."""
     return np.concatenate([rotation_vector(X_goal[:3, :3] @ R.T), X_goal[:3, 3] - p])
 
 
@@ -96,7 +96,7 @@ class DhChain:
 
 
 def dh_parameters(model: ArmModel) -> DhChain:
-    """The numbers whose plain chain is the model's: prod RotZ(q_i + theta_i) Tz(d_i) Tx(a_i) RotX(alpha_i).
+    """Return the numbers whose plain chain is the model's: prod RotZ(q_i + theta_i) Tz(d_i) Tx(a_i) RotX(alpha_i).
 
     Each link transform is split about the common normal of its two joint axes into
     RotZ(theta') Tz(d') Tx(a) RotX(alpha) RotZ(theta) Tz(d); the primed parts belong to the joint before. The model may

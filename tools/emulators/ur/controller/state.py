@@ -98,7 +98,7 @@ class ControllerState:
         self._later.append((self.frame + round(seconds / STEP_S), action))
 
     def pause_program(self) -> None:
-        """The program stands still and the arm brakes on its path; `resume_program` continues from there."""
+        """Pause the program and brake the arm on its path; `resume_program` continues from there."""
         if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
             self.runtime_state = RuntimeState.PAUSING
 
@@ -161,7 +161,7 @@ class ControllerState:
         self.arm.set_tcp(self.tcp_offset)
 
     def touch(self) -> Array:
-        """The wrench on the tool centre point in base axes, from the surroundings or from a client's sensor."""
+        """Return the wrench on the tool centre point in base axes, from the surroundings or from a client's sensor."""
         if self.sensor.external:
             X = self.arm.flange(self.arm.q)[:3, :3]
             return np.concatenate([X @ self.sensor.written[:3], X @ self.sensor.written[3:]])

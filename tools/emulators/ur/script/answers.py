@@ -37,7 +37,7 @@ def six(values: Any, what: str, count: int = 6) -> Array:
 
 
 def positive(value: Any, what: str) -> float:
-    """A positive finite number out of a script; raises ScriptError where it is not."""
+    """Return a positive finite number out of a script; raises ScriptError where it is not."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0.0:
         raise ScriptError(f"{what} must be a positive number, it is {value!r}.")
     return float(value)

@@ -45,7 +45,7 @@ class Effort:
 
 
 def copied(value: Any) -> Any:
-    """A list or struct of its own, since assignment copies; anything else as it is."""
+    """Return a list or struct of its own, since assignment copies; anything else as it is."""
     if type(value) in NUMBERS:
         return value
     if value is None:
@@ -67,7 +67,7 @@ def listed(*items: Any) -> list[Any]:
 
 
 def bounded(value: Any) -> Any:
-    """The value, where it is not too large and not nested too deeply."""
+    """Return the value, where it is not too large and not nested too deeply."""
     if isinstance(value, list | Struct | str) and (parts := _parts(value, 0)) > LOOP_EFFORT:
         Effort.spend(parts)
     return value
@@ -89,7 +89,7 @@ def _parts(value: Any, depth: int) -> int:
 
 
 def whole(value: Any) -> Any:
-    """The number, where it is no whole number with too many digits."""
+    """Return the number, where it is no whole number with too many digits."""
     if type(value) is int and not -LARGEST <= value < LARGEST:
         raise ScriptError("A whole number has more than 64 bits.")
     return value
@@ -126,7 +126,7 @@ def _at(values: Any, indices: tuple[Any, ...]) -> Any:
 
 
 def truth(value: Any) -> bool:
-    """A condition: True, False, or a number that is not 0 (UR's own control script asks so for a seed)."""
+    """Return a condition: True, False, or a number that is not 0 (UR's own control script asks so for a seed)."""
     if value is True or value is False:
         return value
     if type(value) in NUMBERS:
@@ -135,7 +135,7 @@ def truth(value: Any) -> bool:
 
 
 def number(value: Any) -> Any:
-    """The value, where it is a number."""
+    """Return the value, where it is a number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ScriptError(f"Arithmetic needs a number, it got {value!r}.")
     return value
@@ -269,18 +269,18 @@ def str_len(str: str) -> int:
 
 
 def str_empty(str: str) -> bool:
-    """Whether there is no character."""
+    """Return whether there is no character."""
     return not _text(str)
 
 
 def str_at(src: str, index: int) -> str:
-    """The character at `index`."""
+    """Return the character at `index`."""
     _position(src, index)
     return src[index]
 
 
 def str_sub(src: str, index: int, len: int | None = None) -> str:
-    """The part from `index` on, at most `len` characters; to the end where that is left out or negative."""
+    """Return the part from `index` on, at most `len` characters; to the end where that is left out or negative."""
     _position(src, index)
     return src[index:] if len is None or len < 0 else src[index : index + len]
 
@@ -291,7 +291,7 @@ def str_find(src: str, target: str, start_from: int = 0) -> int:
 
 
 def to_num(str: str) -> int | float:
-    """The number that a text starts with."""
+    """Return the number that a text starts with."""
     match = _NUMBER.match(_text(str))
     if match is None:
         raise ScriptError(f"to_num: {str!r} does not start with a number.")
@@ -321,7 +321,7 @@ def transpose(m: Any) -> Any:
 
 
 def make_list(length: int, initial_value: Any = 0, capacity: int = 0) -> list[Any]:
-    """A list of `length` equal elements."""
+    """Return a list of `length` equal elements."""
     if length > MOST_PARTS:
         raise ScriptError(f"A list has no more than {MOST_PARTS} elements.")
     parts = [initial_value] * int(length)
@@ -330,13 +330,13 @@ def make_list(length: int, initial_value: Any = 0, capacity: int = 0) -> list[An
 
 
 def binary_list_to_integer(l: Any) -> int:  # noqa: E741  (URScript's own name)
-    """The number whose bits are in a list, the lowest first."""
+    """Return the number whose bits are in a list, the lowest first."""
     value = sum(1 << i for i, bit in enumerate(l[:32]) if bit)
     return value - (1 << 32) if len(l) == 32 and l[31] else value
 
 
 def struct(**members: Any) -> Struct:
-    """A struct with these members."""
+    """Return a struct with these members."""
     made: Struct = bounded(copied(Struct(members)))
     return made
 

@@ -64,7 +64,7 @@ def translate(routine: Routine, builtins: frozenset[str], blocking: frozenset[st
 
 
 def bind(translation: Translation, builtins: Mapping[str, Callable[..., Any]], hooks: Hooks) -> Compiled:
-    """The program with the controller's functions, with variables of its own."""
+    """Return the program with the controller's functions, with variables of its own."""
     namespace: dict[str, Any] = {f"b_{name}": function for name, function in builtins.items()}
     namespace |= {name: getattr(arithmetic, name) for name in (*_OPERATORS.values(), *_HELPERS)}
     namespace |= {
@@ -214,7 +214,7 @@ class _Emitter:
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
     def _truth(self, expression: Expression) -> str:
-        """The expression as a condition.
+        """Return the expression as a condition.
 
         What can only be True or False is not asked what it is, a hundred times a frame.
         """

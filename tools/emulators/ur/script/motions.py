@@ -129,7 +129,7 @@ class Motions(Sockets):
         return joints
 
     def _goal_pose(self, goal: Any, what: str) -> Array:
-        """The tool's pose (4, 4) of a goal given as a pose or as joint angles."""
+        """Return the tool's pose (4, 4) of a goal given as a pose or as joint angles."""
         values, arm = six(goal, what), self._controller.arm
         return matrix(values) if isinstance(goal, Pose) else np.asarray(arm.flange(values) @ arm.X_FT)
 
@@ -165,7 +165,7 @@ def _timed(length: float, t: float, a: float) -> tuple[float, float]:
 
 
 def _share(value: Any, what: str) -> float:
-    """A share of what the arm can do."""
+    """Return a share of what the arm can do."""
     if positive(value, f"The {what}") > 1.0:
         raise ScriptError(f"The {what} is a share of what the arm can do, from 0 to 1, not {value!r}.")
     return float(value)

@@ -39,7 +39,7 @@ class Token:
 
 
 def tokenize(source: str) -> list[Token]:
-    """All tokens, comments and labels ($ lines) left out, one token of kind `end` at the end.
+    """Return all tokens, comments and labels ($ lines) left out, one token of kind `end` at the end.
 
     Raises:
         ScriptError: a character that no URScript word starts with.
@@ -65,7 +65,7 @@ def tokenize(source: str) -> list[Token]:
 
 
 def split_programs(buffer: str) -> tuple[list[str], str]:
-    """The complete programs at the start of what has arrived, and the rest that waits for more.
+    """Return the complete programs at the start of what has arrived, and the rest that waits for more.
 
     A program is a def or sec with its matching `end`, in whatever column, or a single line.
     """
@@ -104,7 +104,7 @@ def _program_length(buffer: str) -> int | None:
 
 
 def parse_program(source: str) -> Routine:
-    """The one def or sec of `source`, or a single line as a program of its own.
+    """Return the one def or sec of `source`, or a single line as a program of its own.
 
     Raises:
         ScriptError: the text is not a program of the subset.

@@ -67,7 +67,7 @@ class Program:
 
     @property
     def line(self) -> int:
-        """The URScript line at which the main body stands."""
+        """Return the URScript line at which the main body is."""
         thread = self._threads.get(self._main)
         frame = getattr(thread.slices, "gi_frame", None) if thread else None
         return self._script_line(frame.f_lineno) if frame is not None else 0

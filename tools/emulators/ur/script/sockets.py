@@ -67,7 +67,7 @@ class Sockets(Forces):
             yield
 
     def protective_stop(self) -> None:
-        """The program stands still from its next frame on; one that has nothing left to do ends."""
+        """Stop the program from its next frame on; one that has nothing left to do ends."""
         self._controller.protective_stop("a protective stop was triggered", code=209)
 
     def socket_open(self, address: str, port: int, socket_name: str = NAME) -> Slices:

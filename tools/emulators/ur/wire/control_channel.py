@@ -24,7 +24,7 @@ LARGEST = 1e9  # of the numbers that a request may hold
 
 
 class LoopWorld:
-    """What the loop itself needs to know: how long it stands still, is unplugged, jitters, and when it ends."""
+    """Hold what the loop itself needs: how long it pauses, is unplugged, jitters, and when it ends."""
 
     def __init__(self) -> None:
         self.frozen_until = 0.0
@@ -145,7 +145,7 @@ class ControlServer(Server):
                 connection.send(json.dumps(self.answer(line, now)).encode() + b"\n", now)
 
     def answer(self, line: bytes, now: float) -> dict[str, Any]:
-        """The reply to one line; `ok` is false and `error` says why where it cannot be done."""
+        """Return the reply to one line; `ok` is false and `error` says why where it cannot be done."""
         try:
             request = json.loads(line)
             if not isinstance(request, dict):
@@ -310,7 +310,7 @@ def _finite(value: Any, what: str) -> float:
 
 
 def _count(request: Request, key: str, count: int) -> int:
-    """A whole number from 0 to count - 1."""
+    """Return a whole number from 0 to count - 1."""
     if request.get(key) not in range(count):
         raise InputError(f"Give a number from 0 to {count - 1} as {key!r}.")
     return int(request[key])

@@ -16,7 +16,7 @@ IDLE_PROGRAM = "def {name}():\n  while True:\n    sync()\n  end\nend\n"
 
 
 def serial_number(arm: str) -> str:
-    """A serial number for an emulated arm, another for each model."""
+    """Return a serial number for an emulated arm, another for each model."""
     return f"202355{1 + FIRST_IS_ONE.index(arm):05d}"
 
 
@@ -75,7 +75,7 @@ class DashboardServer(Server):
                 return
 
     def answer(self, command: str) -> str:
-        """The reply to one command, without its newline."""
+        """Return the reply to one command, without its newline."""
         lower = command.lower()
         if lower in self._fixed:
             return self._fixed[lower]()
@@ -180,7 +180,7 @@ class DashboardServer(Server):
         return "No longer controlling the operational mode."
 
     def _generate(self, what: str) -> str:
-        """A report or a support file: the answers of a controller, without a file."""
+        """Return a report or a support file: the answers of a controller, without a file."""
         self._count += 1
         if what.startswith("flight report"):
             return f"Flight Report generated with id: {self._count}"

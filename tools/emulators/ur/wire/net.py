@@ -39,7 +39,7 @@ class LinkFaults:
     half_open: bool = False
 
     def deaf(self, now: float) -> bool:
-        """Whether what comes in is not heard."""
+        """Return whether what comes in is not heard."""
         return (now if self.deaf_clock is None else self.deaf_clock()) < self.deaf_until
 
 
@@ -144,7 +144,7 @@ class Connection:
         yield from map(bytes, lines)
 
     def readable(self, now: float) -> bool:
-        """Whether the loop should look at this socket."""
+        """Return whether the loop should look at this socket."""
         return not (self.closed or self.faults.half_open or now < self.faults.freeze_until)
 
     def close(self, *, reset: bool) -> None:

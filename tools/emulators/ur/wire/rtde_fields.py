@@ -57,7 +57,7 @@ def _constant(value: Any) -> Getter:
 
 
 def _constants(value: Any, names: str) -> dict[str, Getter]:
-    """The same constant for several fields, named with spaces between."""
+    """Return the same constant for several fields, named with spaces between."""
     return dict.fromkeys(names.split(), _constant(value))
 
 
@@ -76,7 +76,7 @@ def _joint_modes(c: Controller) -> list[int]:
 
 
 def outputs() -> dict[str, Output]:
-    """All output fields."""
+    """Return all output fields."""
     fields: dict[str, Output] = {}
     for direction in ("input", "output"):
         fields |= _register_outputs(direction)
@@ -193,7 +193,7 @@ def _set(bank: str, i: int, c: Controller, value: Any) -> None:
 
 
 def inputs() -> dict[str, Input]:
-    """All plain input fields; the masked ones (terminals, slider) are applied together by `apply_masked`."""
+    """Return all plain input fields; the masked ones (terminals, slider) are applied together by `apply_masked`."""
     fields = {
         "input_bit_registers0_to_31": Input("UINT32", lambda c, v: c.inputs.set_word(0, v)),
         "input_bit_registers32_to_63": Input("UINT32", lambda c, v: c.inputs.set_word(32, v)),

@@ -216,7 +216,7 @@ class ExternalControl(Server):
 
 
 def kinematics_info(model: ArmModel) -> bytes:
-    """The body of KinematicsInfo.
+    """Return the body of KinematicsInfo.
 
     Six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated.
     """

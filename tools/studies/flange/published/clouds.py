@@ -98,7 +98,7 @@ class CloudsOutcome:
     """A folder of scans.
 
     ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the verification, at the
-    camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
+    camera (roll, pitch, yaw, x, y, z) and at the flange. ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
     ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step.
     """
 
@@ -226,7 +226,7 @@ def study_clouds(
 
 
 def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Material:
-    """Fit every cloud both ways; clouds that either method refuses are left out of the comparison."""
+    """Fit every cloud by both methods; clouds that either method refuses are left out of the comparison."""
     seen = fit_flanges(data, standard, seed=seed)
     good = {o.id: o for o in seen.observations}
     clouds = {id: data.cloud(id) for id in data.clouds if id in good}
@@ -298,7 +298,7 @@ def _circle_row(material: Material, id: str, R_BC: Array, seed: int) -> CircleRo
 
 
 def see_halves(face: Array, half: NDArray[np.bool_], standard: FlangeStandard) -> tuple[Array, Array]:
-    """The edges' centres (3,) m from either half of a cloud."""
+    """Return the edges' centres (3,) m from either half of a cloud."""
     return fit_flange(face[half], standard).center_C, fit_flange(face[~half], standard).center_C
 
 

@@ -130,7 +130,7 @@ def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[s
 
 
 def run_sphere_study(scans: int, draws: int, seed: int, progress: Progress = no_progress) -> dict[str, object]:
-    """The comparison as a JSON object, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
+    """Return the comparison as a JSON object, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
     rows, false = compare_sphere(seed, draws, scans, progress)
     return {
         "scans": scans,
@@ -218,7 +218,7 @@ def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Pu
 
 
 def find_datasets(folder: Path) -> list[Dataset]:
-    """Every dataset in the folders of a folder (or the one that it is), by name.
+    """Return every dataset in the folders of a folder (or the one that it is), by name.
 
     Raises InputError where there is none.
     """

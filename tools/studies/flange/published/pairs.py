@@ -50,7 +50,7 @@ class PairsOutcome:
     """One robot of which centre pairs are known. Errors in m at the flange centre, gross outliers (named) not scored.
 
     ``table1`` (6,): roll, pitch, yaw (rad), x, y, z (m) of the all-pairs H against the implied one, None without stored
-    runs; ``own_pool`` errors on the four pairs each run kept, ``true`` on all others; ``svd`` and ``ours`` held out in
+    runs. ``own_pool`` errors on the four pairs each run kept, ``true`` on all others. ``svd`` and ``ours`` held out in
     5 folds.
     """
 
@@ -88,7 +88,7 @@ def load_runs(folder: Path) -> StoredRuns | None:
 def study_pairs(
     name: str, title: str, pairs: list[Observation], runs: StoredRuns | None, *, repeats: int, seed: int
 ) -> PairsOutcome:
-    """Table 1's row, the truth of the stored runs, and held-out errors of both ways to use all pairs."""
+    """Return Table 1's row, the truth of the stored runs, and held-out errors of both methods on all pairs."""
     estimate = estimate_eye_on_base(pairs, SolveConfig(seed=seed, leave_one_out=False))
     good = [o for o, keep in zip(pairs, estimate.inliers, strict=True) if keep]
     outliers = tuple(o.id for o, keep in zip(pairs, estimate.inliers, strict=True) if not keep)
@@ -166,7 +166,7 @@ class KinectOutcome:
     """Errors (m) at the wrist ring.
 
     ``residual`` of the all-pairs SVD, ``held_out`` of it and ``ours`` of the robust fit in 5 folds, ``compensated``
-    of H e with the paper's own e (Eq. (21)); ``shift_m`` how far that e moves the middle of the workspace, and
+    of H e with the paper's own e (Eq. (21)). ``shift_m`` how far that e moves the middle of the workspace, and
     ``at_camera_m`` its translation, taken at the camera.
     """
 
@@ -181,7 +181,7 @@ class KinectOutcome:
 
 
 def paper_error() -> RigidTransform:
-    """The e of section 4.2 as a transform."""
+    """Return the e of section 4.2 as a transform."""
     return RigidTransform(RollPitchYaw(*np.radians(PAPER_E_RPY_DEG)), 1e-3 * np.array(PAPER_E_XYZ_MM))
 
 

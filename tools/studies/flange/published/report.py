@@ -38,7 +38,7 @@ class PublishedResults:
     notes: tuple[str, ...]
 
     def summary(self) -> dict[str, object]:
-        """The result for JSON: millimetres and degrees where the key says so."""
+        """Return the result for JSON: millimetres and degrees where the key says so."""
         sim, axes = self.simulation, ("roll", "pitch", "yaw", "x", "y", "z")
         return {
             "notes": self.notes,
@@ -368,7 +368,7 @@ def sight_rows(outcome: CloudsOutcome) -> list[Row]:
 
 
 def kinect_rows(study: PublishedResults) -> list[Row]:
-    """The all-pairs SVD, held out, ours, and the compensated one, errors at the wrist ring."""
+    """Return the all-pairs SVD, held out, ours, and the compensated one, errors at the wrist ring."""
     return [
         (what, *_numbers(in_mm(errors).values(), 2))
         for k in study.kinect
@@ -382,7 +382,7 @@ def kinect_rows(study: PublishedResults) -> list[Row]:
 
 
 def tables(study: PublishedResults) -> list[Table]:
-    """Every table of the study that has lines."""
+    """Return every table of the study that has lines."""
     found: list[Table] = []
     if study.pairs or study.clouds:
         found.append(("Table 1: all pairs, no iteration", TABLE1_HEADER, table1_rows(study)))
@@ -405,7 +405,7 @@ def _six(e: Array, degree_digits: int) -> tuple[str, ...]:
 
 
 def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int) -> tuple[str, ...]:
-    """A calibration's own figure, the true errors and their ratio."""
+    """Return a calibration's own figure, the true errors and their ratio."""
     true = in_mm(errors_m)
     ratio = f"{true['median'] / reported_mm:.1f}×" if reported_mm else "–"
     return (name, fixed(reported_mm, digits), *_numbers(true.values(), digits), ratio)

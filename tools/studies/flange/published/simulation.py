@@ -41,7 +41,7 @@ COSTS = {
 class Errors:
     """Errors of K calibrations.
 
-    ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes them; ``at_tcp`` (K,
+    ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes them. ``at_tcp`` (K,
     75) m, how far each flange centre is put from where it is.
     """
 
@@ -80,7 +80,7 @@ class Simulation:
 
 
 def grid_points() -> Array:
-    """The 75 flange centres (75, 3) m in the base."""
+    """Return the 75 flange centres (75, 3) m in the base."""
     axes = [c + np.linspace(-0.5, 0.5, n) * w for c, n, w in zip(WORKSPACE_CENTRE_M, GRID, WORKSPACE_M, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
