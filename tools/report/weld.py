@@ -247,14 +247,14 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     path, errors, woven = log.p_BTorch.copy(), [], []
     for k, part in enumerate(welds(log)):
         on, true = part & log.torch_on, true_seam(cell.station.truth, numbers.get(k, k))
-        line = plan if true is None and part[-1] else true
-        if line is None or not on.any():
+        curve = plan if true is None and part[-1] else true
+        if curve is None or not on.any():
             continue
-        off = path_error(log.p_BTorch[on], line)
+        off = path_error(log.p_BTorch[on], curve)
         if weave.amplitude_m:
             woven.append(measure_weave(log.time[on], off, weave.period_s, weave.plane_rad))
             off = _unwoven(log.time[on], off, weave)
-            path[on] = line.position(off.s) + (off.lateral * line.normal(off.s).T + off.height * line.up(off.s).T).T
+            path[on] = curve.position(off.s) + (off.lateral * curve.normal(off.s).T + off.height * curve.up(off.s).T).T
         if true is not None:
             errors.append(off)
     speed = _together([speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in parts])
