@@ -267,6 +267,9 @@ def check_scenario(scenario: Scenario) -> None:
     scenario.welding.process.process()
     scenario.welding.order.check()
     scenario.welding.arc.check(scenario.robot.reports_arc)
+    weave = scenario.welding.weave
+    if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
+        raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
     scenario.planning.planning_method()
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration

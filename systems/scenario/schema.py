@@ -1,6 +1,7 @@
 """The schema of a scenario YAML: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
+import math
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,6 +17,7 @@ from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
 LONGEST_STAND_S = 10.0  # a choice: an arc that stands for longer burns through
@@ -138,6 +140,34 @@ class ProcessConfig:
         return WeldProcess(self.name, self.current_A, self.voltage_V, self.efficiency, self.wire_feed_m_min)
 
 
+@dc.dataclass(kw_only=True)
+class WeaveOrder:
+    """The weave: the torch swings across the seam while the tip keeps its path."""
+
+    shape: str = "sine"  # sine, triangle, trapezoid or crescent
+    amplitude_mm: float = 2.0  # to each side, at most 8
+    frequency_hz: float = 1.0  # swings a second, the dwells not counted, at most 5
+    dwell_s: list[float] | float | int = 0.0  # rest at the sides: one number, or those of the left and the right
+    # how far a crescent's sides lag behind its middle; negative: they lead; null: a quarter of the amplitude
+    bow_mm: float | None = None
+    plane_deg: float = 0.0  # tilt of the weave's plane about the seam, left side up; 0: square to the joint's bisector
+
+    def weave(self) -> WeaveConfig:
+        """The order as a WeaveConfig; raises WeaveError for an invalid one."""
+        dwell = self.dwell_s if isinstance(self.dwell_s, list) else [float(self.dwell_s)]
+        if len(dwell) not in (1, 2):
+            raise WeaveError(f"welding.weave.dwell_s must hold one number or two, not {len(dwell)}.")
+        return WeaveConfig(
+            shape=self.shape,
+            amplitude_m=1e-3 * self.amplitude_mm,
+            frequency_hz=self.frequency_hz,
+            dwell_left_s=dwell[0],
+            dwell_right_s=dwell[-1],
+            bow_m=None if self.bow_mm is None else 1e-3 * self.bow_mm,
+            plane_rad=math.radians(self.plane_deg),
+        )
+
+
 @dc.dataclass
 class ArcConfig:
     """How the arc starts and ends."""
@@ -194,6 +224,7 @@ class WeldingConfig:
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
     order: WeldOrder = dc.field(default_factory=WeldOrder)
+    weave: WeaveOrder | None = None  # null: a stringer bead
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must

@@ -232,6 +232,7 @@ welding:
   order: {order: o, wps: w, wpqr: q, drawing: d, part: p, serial: s, batch: b, operator: x, material: m, filler: f,
     filler_batch: fb, gas: g, position: PA, note: n, limits: {heat_input_kJ_mm: [0.5, 1.0], speed_mm_s: [7.0, 9.0],
     current_A: [80.0, 100.0], voltage_V: [10.0, 12.0], path_mm: 0.4}}
+  weave: {shape: crescent, amplitude_mm: 1.5, frequency_hz: 1.5, dwell_s: [0.1, 0.2], bow_mm: 0.5, plane_deg: 10.0}
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4

@@ -35,7 +35,7 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document
+from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, weave_document
 from weldcal.tools.report.weld_record import PartRecord
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.record.weld_log import heat_summary
@@ -236,6 +236,8 @@ class DemoResult:
             found["heat_input_kJ_mm"] = None if heat is None else heat[0]
         if self.record is not None:
             found |= self.record.summary()
+        if self.weld is not None and self.weld.weave:
+            found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m

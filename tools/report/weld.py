@@ -1,5 +1,6 @@
 """Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,9 +26,14 @@ from weldcal.systems.station import Truth
 from weldcal.tools.report.files import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
+from weldcal.welding.record.weave import MeasuredWeave, measure_weave
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
+from weldcal.welding.servo.weave import WeaveConfig, weave_at
+
+HELD_S = 0.1  # between two rows with the arc on: it was out in between
+LATEST_S = 0.35  # a choice: an arc that takes 0.12 s, a stop of 0.15 s, and the arm's lag
 
 
 def true_work_point(
@@ -82,6 +88,8 @@ class WeldOutcome:
     speed: SpeedStatistics | None
     plan_error: PathError | None  # of the newest plan, that of the last seam
     seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
+    weave: tuple[MeasuredWeave | None, ...] = ()  # of each seam, where a weave was ordered
+    path: Array | None = None  # (N, 3) m of the torch, without its weave
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,23 +235,86 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
-    wanted = cell.job.servo_config.weld_speed_m_s
+    wanted, weave = cell.job.servo_config.weld_speed_m_s, cell.job.servo_config.weave
     parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
     if not parts:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
-    speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
-    if seam is None:
-        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
     numbers = dict(enumerate(record.seam for record in cell.job.planned_seam(root).records))
-    errors = tuple(
-        path_error(log.p_BTorch[part & log.torch_on], true)
-        for k, part in enumerate(welds(log))
-        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, numbers.get(k, k))) is not None
+    path, errors, woven = log.p_BTorch.copy(), [], []
+    for k, part in enumerate(welds(log)):
+        on, true = part & log.torch_on, true_seam(cell.station.truth, numbers.get(k, k))
+        curve = plan if true is None and part[-1] else true
+        if curve is None or not on.any():
+            continue
+        off = path_error(log.p_BTorch[on], curve)
+        if weave.amplitude_m:
+            woven.append(measure_weave(log.time[on], off, weave.period_s, weave.plane_rad))
+            off = _unwoven(log.time[on], off, weave)
+            path[on] = curve.position(off.s) + (off.lateral * curve.normal(off.s).T + off.height * curve.up(off.s).T).T
+        if true is not None:
+            errors.append(off)
+    speed = _together([speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in parts])
+    outcome = WeldOutcome(
+        log=log,
+        true_seam=seam,
+        planned=plan,
+        error=None,
+        speed=speed,
+        plan_error=plan_error,
+        weave=tuple(woven),
+        path=path,
     )
+    if not errors:
+        return outcome
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
-    return WeldOutcome(
-        log=log, true_seam=seam, planned=plan, error=error, speed=speed, plan_error=plan_error, seams=errors
-    )
+    return replace(outcome, error=error, seams=tuple(errors))
+
+
+def _unwoven(time: Array, off: PathError, weave: WeaveConfig) -> PathError:
+    """The torch's distance (N,) from the ordered weave, which begins anew where the arc does, as late as fits best."""
+    s, lateral, height = off.s.copy(), off.lateral.copy(), off.height.copy()
+    c, d = math.cos(weave.plane_rad), math.sin(weave.plane_rad)
+    for rows in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > HELD_S) + 1):
+        t = time[rows] - time[rows[0]]
+        grid = np.arange(-LATEST_S, t[-1] + 0.1, 1e-3)
+        swings = np.array([weave_at(weave, at) for at in grid])
+        side = c * lateral[rows] + d * height[rows]
+        late = min(
+            np.arange(-0.05, LATEST_S, 2e-3), key=lambda by: np.ptp(side - np.interp(t - by, grid, swings[:, 0]))
+        )
+        across, ahead = (np.interp(t - late, grid, swings[:, k]) for k in (0, 2))
+        lateral[rows] -= c * across
+        height[rows] -= d * across
+        s[rows] -= ahead
+    return PathError(s, lateral, height)
+
+
+def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
+    """The ordered weave and the measured one of each seam; the mean path off the seam where a simulation knows that."""
+    dwell_s, known = order.dwell_left_s + order.dwell_right_s, weld.error is not None
+    ordered = {
+        "shape": order.shape,
+        "amplitude_mm": 1e3 * order.amplitude_m,
+        "frequency_hz": order.frequency_hz,
+        "dwell_s": [order.dwell_left_s, order.dwell_right_s],
+        "bow_mm": 1e3 * order.lag_m,
+        "plane_deg": float(np.degrees(order.plane_rad)),
+    }
+    mean = order.amplitude_m * (order.dwell_left_s - order.dwell_right_s) / order.period_s
+    middle = mean * np.array([np.cos(order.plane_rad), np.sin(order.plane_rad)])
+    measured = [
+        None
+        if m is None
+        else {
+            "amplitude_mm": 1e3 * m.amplitude_m,
+            "frequency_hz": 1.0 / (m.period_s - dwell_s),
+            "bow_mm": 1e3 * m.bow_m,
+            "mean_path_mm": 1e3 * float(np.hypot(*(np.array([m.left_m, m.up_m]) - middle))) if known else None,
+            "swings": m.swings,
+        }
+        for m in weld.weave
+    ]
+    return {"ordered": ordered, "measured": measured}
 
 
 def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:

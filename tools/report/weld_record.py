@@ -131,7 +131,9 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
     p_BW = log.p_BRobot + log.R_BT @ config.p_TW
-    speed = speed_along(log.time, p_BW)
+    speed = travel_speed = speed_along(log.time, p_BW)
+    if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
+        travel_speed = speed_along(log.time, np.outer(log.telemetry["s_torch"], [1.0, 0.0, 0.0]))
     up = np.full((len(log.time), 3), np.nan)
     if weld.planned is not None:
         up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
@@ -154,7 +156,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_rad_s": named["omega"],
         "work_angle_rad": np.where(moving, work, np.nan),
         "travel_angle_rad": np.where(moving, travel, np.nan),
-        "heat_input_J_m": process.heat_input(np.where(log.torch_on, speed, np.nan), arc[:, 1], arc[:, 2]),
+        "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan), arc[:, 1], arc[:, 2]),
     }
     settings = {
         "software": software_version(),
@@ -168,6 +170,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
         "law": config.law,
+        "woven": bool(config.weave.amplitude_m),
         "felt": felt_seams(run),
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),

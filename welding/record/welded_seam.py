@@ -80,6 +80,8 @@ def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> Wel
     dt = np.diff(time[on])
     dt = np.where(dt > GAP_S, 0.0, dt)
     length = record["torch_speed_m_s"][on][:-1] * dt
+    if record.settings.get("woven"):  # metal is deposited along the seam, not along the swings
+        length = np.where(dt > 0.0, np.abs(np.diff(record["s_torch_m"][on])), 0.0)
     current, voltage, source = arc_values(record, on)
     heat = (record.process.k or math.nan) * voltage[:-1] * current[:-1] * dt  # J, EN 1011-1 and ISO/TR 18491
     stretch = np.minimum(np.cumsum(length) // STRETCH_M, max(length.sum() // STRETCH_M - 1.0, 0.0)).astype(int)

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
+from weldcal.welding.servo.weave import Learnt
 
 
 class Phase(StrEnum):
@@ -181,6 +182,7 @@ class WeldingState:
     advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
     lit_at: float = math.nan
+    weave: Learnt = field(default_factory=Learnt)
     arc_seen: bool = False
     arc_waited_s: float = 0.0
     stand: str = ""

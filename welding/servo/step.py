@@ -23,10 +23,10 @@ from weldcal.welding.servo.contact import (
 from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step, mean_residual
 from weldcal.welding.servo.laws import get_law, motion_law
-from weldcal.welding.servo.settings import ServoConfig, weave_at
+from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import check_length, touch_step
-from weldcal.welding.servo.track import torch_target
+from weldcal.welding.servo.track import torch_target, weaving
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
@@ -271,8 +271,7 @@ def _weld(
     p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
     target = torch_target(state, curve, p_BW, config)
     if state.torch_on and config.weave.amplitude_m > 0.0:
-        offset, rate = weave_at(config.weave, sample.time - state.lit_at)
-        target = target._replace(point=target.point + offset * target.normal, rate=rate)
+        state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
     motion = motion_law(law)(
         state, sample.X_BT, turned(seam, state.felt + state.steer), target, (state.u_n, state.u_a), config, dt
     )

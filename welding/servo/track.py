@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.welding.numerics import Array, box_least_squares, clip, cross, dot, norm, unit
+from weldcal.welding.numerics import Array, box_least_squares, changed, clip, cross, dot, norm, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.servo.guards import SeamConditioning, seam_conditioning
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
+from weldcal.welding.servo.weave import learn, weave_at
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
 _CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no committed point
@@ -29,7 +30,8 @@ _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame
 class TorchTarget(NamedTuple):
     """The torch's target: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m.
 
-    `bend`: of the path to the left, 1/m; `rate`: its wanted speed to the left, m/s.
+    `bend`: of the path to the left, 1/m; `rate`: of the weave, along the seam, to the left and up, m/s; `turning`: the
+    weave's largest acceleration to the side, m/s^2.
     """
 
     point: Array
@@ -40,7 +42,8 @@ class TorchTarget(NamedTuple):
     s: float
     residual: Array
     bend: float = 0.0
-    rate: float = 0.0
+    rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turning: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,24 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     )
 
 
+def weaving(
+    state: WeldingState, target: TorchTarget, p_BW: Array, since_s: float, config: ServoConfig, dt: float
+) -> tuple[WeldingState, TorchTarget]:
+    """The target in its weave so many seconds after the arc was lit, and what the torch (3,) m shows of the arm's lag.
+
+    The rates are those after the arm's lag. The place is where the arm, as late as it has shown to be, is now.
+    """
+    weave, learnt = config.weave, state.weave
+    now, then = weave_at(weave, since_s - learnt.late_s), weave_at(weave, since_s + config.lag_s)
+    left, up = math.cos(weave.plane_rad), math.sin(weave.plane_rad)
+    side = left * target.normal + up * target.up
+    point = target.point + now.side * side
+    rate = (1.0 + learnt.loss) * then.side_rate
+    state = changed(state, weave=learn(learnt, weave, now, dot(p_BW - point, side), dt))
+    rates = (then.ahead_rate, left * rate, up * rate)
+    return state, target._replace(point=point, rate=rates, turning=weave.side_peaks[1])
+
+
 def _carried_on(
     seam: RefinedSeam, fit: LocalFit, inside: float, arc: float, plan: SeamFrame, config: ServoConfig
 ) -> LocalFit | None:
@@ -213,14 +234,15 @@ def guarded_motion(
     t, n, b = target.tangent, target.normal, target.up
     e = axes.torch - target.point
     limit = torch.feedback_limit_m
-    back_n = target.rate - torch.k_b * clip(dot(e, n), -limit, limit)
-    back_b = -torch.k_h * clip(dot(e, b), -limit, limit)
+    ahead, left, rise = target.rate
+    back_n = left - torch.k_b * clip(dot(e, n), -limit, limit)
+    back_b = rise - torch.k_h * clip(dot(e, b), -limit, limit)
 
     # A command takes effect after the robot's lag: the rows look that far ahead along the path.
     turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.6, 0.6)
     t, n = math.cos(turn) * t + math.sin(turn) * n, math.cos(turn) * n - math.sin(turn) * t
-    swing = clip(state.omega * config.lag_s, -0.1, 0.1)
-    m_then = math.cos(swing) * m - math.sin(swing) * u
+    swung = clip(state.omega * config.lag_s, -0.1, 0.1)
+    m_then = math.cos(swung) * m - math.sin(swung) * u
 
     # V_W = v t_s + V_0 - d w m + d w_p a. The height row gives w_p; putting it in leaves x -> x - (x.b)/(a.b) a.
     ab = height_share(axes, b)
@@ -236,6 +258,9 @@ def guarded_motion(
     radius = 1.0 / max(abs(tip.curvature), 1e-6)
     top = min(limits.tip_speed_max_m_s, max(limits.tip_speed_floor * speed, limits.turn_rate_max_rad_s * radius))
     dv, dw, w_top = (limits.tip_acceleration_m_s2 * dt, limits.omega_acceleration_rad_s2 * dt, limits.omega_max_rad_s)
+    # The weave, which the arm has been found able to do, comes on top of the path's own turning.
+    swing = target.turning / d * dt
+    dw += swing
     # Where the tip would have to move square to the torch's path, or against it, the tip must not stop for the torch's
     # speed: the tip creeps round, and the torch waits.
     creep = limits.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
@@ -250,15 +275,15 @@ def guarded_motion(
     v, w = box_least_squares(
         (
             (weights.lateral, n_v, n_w, back_n - n_0),
-            (weights.torch_speed, t_v, t_w, speed - t_0),
+            (weights.torch_speed, t_v, t_w, speed + ahead - t_0),
             (weights.omega, 0.0, d, 0.0),
-            (weights.tip_speed, 1.0, 0.0, speed),
+            (weights.tip_speed, 1.0, 0.0, speed + ahead),
         ),
         (v_low, v_high),
         (w_low, max(w_low, w_high)),
     )
     w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
-    w_p_then, w_p_step = dot(state.V[:3], m), limits.pitch_acceleration_rad_s2 * dt
+    w_p_then, w_p_step = dot(state.V[:3], m), limits.pitch_acceleration_rad_s2 * dt + swing
     w_p = clip(w_p, w_p_then - w_p_step, w_p_then + w_p_step)
 
     # Roll about the level chord holds the work angle; the roll caused by yaw about a tilted tool axis is subtracted.

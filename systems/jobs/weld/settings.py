@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -13,18 +13,21 @@ from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerC
 from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
 from weldcal.models.arms.chain import chain_of
+from weldcal.models.arms.compiled_kinematics import tick_jacobian
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.workpieces.part import WeldPart, is_felt, numbered, seam_count
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
-from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
+from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
 from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
     TORCH_ABOVE_ROOT_M,
@@ -36,6 +39,8 @@ from weldcal.welding.servo.settings import (
     TorchControl,
     TouchOnConfig,
 )
+from weldcal.welding.servo.tool_axes import tool_path
+from weldcal.welding.servo.weave import WEAVE_SHARE, Bound, WeaveConfig, check_weave
 
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
@@ -46,6 +51,7 @@ NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
 _UNPRESSED_M = 1e-9  # of a tip that is not used
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 SCAN_CLEAR_M = 0.02  # from a part that is not found yet
+WEAVE_EVERY = 25  # places of a seam at which a weave is checked: 25 mm, a choice
 
 
 def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
@@ -61,7 +67,60 @@ def feature_standard(scenario: Scenario) -> FlangeStandard:
 
 
 def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoConfig:
-    """The servo's settings from scenario and tool, for a seam by its number."""
+    """The servo's settings from scenario and tool, for a seam by its number.
+
+    Raises:
+        WeaveError: tool or arm cannot do the weave at one of the seams, as they are drawn.
+    """
+    config, order = _straight_on(scenario, station, seam), scenario.welding.weave
+    if order is None or station.tool is None or station.cad is None:
+        return config
+    weave = order.weave()
+    seams = (_arm_bounds(scenario, station, weave, k) for k in range(seam_count(station.cad)))
+    check_weave(weave, [*config.weave_bounds(weave), *chain.from_iterable(seams)])
+    return replace(config, weave=weave)
+
+
+def _arm_bounds(scenario: Scenario, station: Station, weave: WeaveConfig, seam: int) -> list[Bound]:
+    """Speed, acceleration and jerk that a weave asks of each joint along a drawn seam, at its guessed pose.
+
+    A place that the arm does not reach gives none: the planner refuses the seam.
+    """
+    tool, cad, spec, arm = station.tool, station.cad, scenario.workpiece, station.arm
+    assert tool is not None
+    assert cad is not None
+    assert spec is not None
+    part, X_BP = numbered(cad, seam), spec.pose_guess.pose()
+    R_BP, config = X_BP.rotation().matrix(), _straight_on(scenario, station, seam)
+    ups = np.broadcast_to(part.up_P, part.seam_P.shape) @ R_BP.T
+    line, ups, turn_m = ringed(part.seam_P @ R_BP.T + X_BP.translation(), ups)
+    try:
+        path = tool_path(SeamCurve.from_points(line, up=ups, length=turn_m), config)
+    except WeldcalError:
+        return []
+    peaks, X_TF, q = np.zeros((3, 6)), tool.X_FT.inverse(), np.deg2rad(scenario.home_deg)
+    c, s = np.cos(weave.plane_rad), np.sin(weave.plane_rad)
+    for X_BT in path.X_BT[::WEAVE_EVERY]:
+        found = nearest_solution(arm, X_BT @ X_TF, q)
+        if found is None:
+            continue
+        x, y, z = X_BT.rotation().matrix().T
+        twists = np.zeros((6, 3))
+        twists[:3, 0], twists[:3, 1], twists[3:, 2] = c * z + s * y, c * z - s * y, x
+        J = tick_jacobian(arm, found, np.array(tool.X_FT.translation()))
+        gain = np.abs(np.linalg.lstsq(J, twists, rcond=1e-3)[0])
+        side = np.maximum(gain[:, 0], gain[:, 1]) / config.tool.torch_offset_m
+        peaks = np.maximum(peaks, np.outer(weave.side_peaks, side) + np.outer(weave.ahead_peaks, gain[:, 2]))
+    allowed = (SPEED_SHARE * arm.velocity_limit, ACCELERATION_SHARE * arm.acceleration_limit, np.full(6, JERK_LIMIT))
+    return [
+        Bound(k + 1, float(needed), WEAVE_SHARE * float(most))
+        for k in range(3)
+        for needed, most in zip(peaks[k], allowed[k], strict=True)
+    ]
+
+
+def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig:
+    """The servo's settings without a weave."""
     tool, welding = station.tool, scenario.welding
     if tool is None or station.cad is None:
         return ServoConfig()
