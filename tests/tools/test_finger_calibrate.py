@@ -22,7 +22,7 @@ from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.board import CharucoBoard, board_sheet, write_board
 from weldcal.welding.finger.calibration import calibrate_tip
-from weldcal.welding.finger.deformation import TagModel, detect_tag, tag_cells
+from weldcal.welding.finger.deformation import TagLimits, TagModel, detect_tag, tag_cells
 
 SIZE = (400, 300)
 K = np.array([[443.7, 0.0, 203.9], [0.0, 446.2, 144.6], [0.0, 0.0, 1.0]])
@@ -156,6 +156,7 @@ def test_a_scenario_that_names_the_file_sees_a_pinhole_and_the_true_tag(done: ob
         cv2.imread(str(pictures / "touch3.png"), cv2.IMREAD_GRAYSCALE),
         VideoFingerCamera(width=SIZE[0], height=SIZE[1]).camera().camera_matrix,
         tag,
+        TagLimits(lateral_m=1.0, depth_m=1.0),  # the raw picture would be refused
     )
     assert raw.X_KM is not None
     assert np.abs(raw.X_KM.translation() - expected).max() > 3e-4  # without the file it is further off

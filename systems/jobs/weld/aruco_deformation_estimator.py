@@ -24,13 +24,14 @@ IMAGES_KEPT = 10  # 1/3 s of images; after a longer gap the servo has stopped
 class Deformation(Message):
     """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time.
 
-    None before the first.
+    None before the first. `covariance_T` (3,3) m^2 is of the deflection, None without a valid one.
     """
 
     sequence: int = 0
     sample: DeflectionSample | None = None
     reason: str = "no image yet"
     reprojection_px: float = np.nan
+    covariance_T: np.ndarray | None = None
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -132,14 +133,15 @@ def measure_deformation(
 ) -> Deformation:
     """Tag detection and rest-pose difference for one image (grey (H, W)).
 
-    Invalid with a reason where the tag is not seen.
+    Invalid with a reason where the tag is not seen, or where the picture could be off by more than TagLimits.
     """
     seen = detect_tag(image.pixels, camera_matrix, tag)
     X_BT = X_BF @ tool.X_FT
-    if not seen.valid or seen.X_KM is None:
+    if not seen.valid or seen.X_KM is None or seen.covariance_K is None:
         sample = DeflectionSample(image.capture_time, X_BT, np.zeros(3), False)
         return Deformation(image.sequence, sample, seen.reason)
     R_TK = tool.X_FT.rotation().inverse() @ tool.X_FK.rotation()
     deflection = deflection_from_tag(seen.X_KM, tool.X_KM_rest, R_TK)
     sample = DeflectionSample(image.capture_time, X_BT, deflection, True)
-    return Deformation(image.sequence, sample, "", seen.reprojection_px)
+    covariance = R_TK.matrix() @ seen.covariance_K @ R_TK.matrix().T
+    return Deformation(image.sequence, sample, "", seen.reprojection_px, covariance)

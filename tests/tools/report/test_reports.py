@@ -169,7 +169,6 @@ def test_the_picture_of_a_scan_shows_the_found_edge_where_the_points_end() -> No
         outer_radius_m=0.036,
         bore_radius_m=None,
         n_points=1400,
-        n_rim=200,
         coverage=1.0,
     )
     pixels = imread(io.BytesIO(scan_pictures({"p0": ring, "unfitted": ring}, {"p0": fit})))[20:, :, :3]

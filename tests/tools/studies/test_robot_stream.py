@@ -82,7 +82,7 @@ def test_what_was_measured_fits_together(streamed: tuple[StreamReport, Path]) ->
 
 def test_a_new_link_that_has_heard_nothing_yet_gives_no_echo() -> None:
     def link(*heard: int) -> SimpleNamespace:
-        states = iter([SimpleNamespace(heard=k, echo_latency_s=1e-3 * k, age_s=0.0) for k in heard])
+        states = iter([SimpleNamespace(echo=float(k), echo_latency=1e-3 * k, age_s=0.0) for k in heard])
         return SimpleNamespace(state=lambda: next(states))
 
     tap = Tap(link=link(0, 1, 1, 2), command_times=array("d", [0.0]))  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from weldcal.welding.finger.deformation import corners_from_sides
+from weldcal.welding.finger.sides import sides_of_square
 
 TRUE = np.array([[140.3, 92.8], [251.1, 101.4], [242.7, 213.9], [131.6, 204.2]])
 CELLS, OVER = 6, 6
@@ -33,10 +33,10 @@ ROUGH = np.array([[1.0, -0.8], [-0.5, 0.9], [0.7, 0.6], [-1.0, -0.4]])
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.8, 1.2])
 def test_blur_does_not_move_the_corners(blur_px: float) -> None:
-    found = corners_from_sides(picture(blur_px), TRUE + ROUGH, CELLS)
+    found = sides_of_square(picture(blur_px), TRUE + ROUGH, CELLS)
     assert found is not None
     # An edge sharper than a pixel says less about where in the pixel it lies.
-    assert np.abs(found - TRUE).max() < (0.025 if blur_px < 0.5 else 0.01)
+    assert np.abs(found.corners - TRUE).max() < (0.025 if blur_px < 0.5 else 0.01)
 
 
 def test_noise_is_averaged_over_the_sides() -> None:
@@ -44,9 +44,9 @@ def test_noise_is_averaged_over_the_sides() -> None:
     errors = []
     for _ in range(20):
         noisy = np.clip(np.round(clean + 2.0 * rng.standard_normal(clean.shape)), 0, 255).astype(np.uint8)
-        found = corners_from_sides(noisy, TRUE, CELLS)
+        found = sides_of_square(noisy, TRUE, CELLS)
         assert found is not None
-        errors.append(found - TRUE)
+        errors.append(found.corners - TRUE)
     # Two grey levels of 200 in a dozen samples of each of a hundred pixels along a side.
     assert np.std(errors, axis=0).max() < 0.02
 
@@ -55,10 +55,10 @@ def test_a_speck_on_a_side_does_not_count() -> None:
     clean = picture(0.7)
     dirty = clean.copy()
     cv2.circle(dirty, (195, 94), 4, 20, -1)
-    found, wanted = corners_from_sides(dirty, TRUE, CELLS), corners_from_sides(clean, TRUE, CELLS)
+    found, wanted = sides_of_square(dirty, TRUE, CELLS), sides_of_square(clean, TRUE, CELLS)
     assert found is not None
     assert wanted is not None
-    assert np.abs(found - wanted).max() < 0.06
+    assert np.abs(found.corners - wanted.corners).max() < 0.06
 
 
 @pytest.mark.parametrize("what", ["no contrast", "out of the picture", "collapsed"])
@@ -71,4 +71,4 @@ def test_where_a_side_cannot_be_seen_it_says_nothing(what: str) -> None:
         corners = TRUE - np.array([130.0, 0.0])
     else:
         corners = np.repeat(TRUE[:1], 4, axis=0)
-    assert corners_from_sides(image, corners, CELLS) is None
+    assert sides_of_square(image, corners, CELLS) is None
