@@ -72,7 +72,7 @@ def seam_rows(record: WeldRecord, numbers: Sequence[int]) -> Iterator[tuple[int,
 
 
 def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> WeldedSeam | None:
-    """The figures of the seam of these rows (N,); None where its arc did not burn."""
+    """Return the figures of the seam of these rows (N,); None where its arc did not burn."""
     on = np.flatnonzero(rows & record.arc)
     if len(on) < LEAST_ROWS:
         return None

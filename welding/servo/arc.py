@@ -10,7 +10,7 @@ SETTLES_S = 0.1  # a choice: four times the lag of the arm behind its commands (
 
 
 class Stand(StrEnum):
-    """Why the tool stands on the seam while it welds: before the arc, until the seam is hot, or in the crater."""
+    """Why the tool waits on the seam: for the arc, until the seam is hot, or in the crater."""
 
     NONE = ""
     START = "start"

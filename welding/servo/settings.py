@@ -212,8 +212,8 @@ class TorchControl:
             does not start within so much of the seam is a fault.
         ignition_limit_s: longest time from the torch's start to an established arc; arc_lost_s: longest time without it
             after.
-        from_rest: the torch comes to rest at the seam's start before it is asked for; start_s: it stands so long with
-            the arc; crater_s: it stands so long at the seam's end before the arc goes out.
+        from_rest: the torch comes to rest at the seam's start before it is asked for.
+        start_s: it waits so long with the arc. crater_s: it waits so long at the seam's end before the arc goes out.
     """
 
     k_b: float = 4.0

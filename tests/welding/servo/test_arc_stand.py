@@ -35,7 +35,7 @@ def test_the_torch_stands_on_the_seams_start_before_it_is_on() -> None:
     assert run.phase == Phase.DONE
     _, x, v, on = places_and_speeds(run)
     first = int(np.argmax(on))
-    assert np.abs(v[first - 10 : first + 1]).max() < STANDING_M_S
+    assert np.abs(v[first - 2 : first + 1]).max() < STANDING_M_S
     assert x[first] == pytest.approx(0.0, abs=2e-4)
 
 
