@@ -188,7 +188,8 @@ def _refuse_change(change: ChangePoint | None, tcp: TcpOffset | None, observatio
     raise ScannerMoved(
         f"The scanner or the robot's base moved between '{change.before}' and '{change.after}'. The scans before and"
         f" after give two scanner poses, which differ by {1e3 * change.shift_m:.2f} mm at the flange and"
-        f" {np.degrees(change.rotation_rad):.3f} degrees. Calibrate one part: {' or '.join(offers)}. Only the later part"
+        f" {np.degrees(change.rotation_rad):.3f} degrees. Calibrate one part: {' or '.join(offers)}. Only the later"
+        " part"
         " is valid for the scanner where it is now.",
         {
             "change_point": {

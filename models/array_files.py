@@ -211,7 +211,8 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]
     for member in listed:
         if member.compress_type not in _METHODS or member.flag_bits & 1:
             raise InputError(
-                f"The file {path.name} is encrypted, or its compression is not one of NumPy's. Save it again with NumPy."
+                f"The file {path.name} is encrypted, or its compression is not one of NumPy's. Save it again with"
+                " NumPy."
             )
     return {m.filename.removesuffix(".npy"): m for m in listed}
 

@@ -96,7 +96,8 @@ def _with_turn(observations: Sequence[Observation], patterns: Mapping[str, HoleP
     if seen:
         turns = (0.0, *(np.degrees(t) % 360.0 for t in patterns[seen[0].id].other_turns_rad))
         raise TooFewPoses(
-            "The scans show the flange's threads but not its dowel hole. The rotation about the axis is therefore one of "
+            "The scans show the flange's threads but not its dowel hole. The rotation about the axis is therefore"
+            " one of "
             f"{', '.join(f'{t:.0f}' for t in sorted(turns))} degrees. Clear the dowel hole, or take four poses or more."
         )
     raise TooFewPoses("No scan shows the flange's holes well enough. Scan from nearer, or take four poses or more.")

@@ -231,7 +231,8 @@ def _no_poses(found: Profiles) -> str:
     kind = f" ({found.form})" if found.form else ""
     return (
         f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Add a"
-        " file poses.csv beside it, or name one with --poses FILE. It has one row for the flange's pose at each profile:"
+        " file poses.csv beside it, or name one with --poses FILE. It has one row for the flange's pose at each"
+        " profile:"
         " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA)."
     )
 

@@ -209,7 +209,8 @@ def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting
     if len(data.readings) > 1:
         if not name:
             raise InputError(
-                "The poses fit several conventions, and only the scans can decide. Name the flange, for example --flange"
+                "The poses fit several conventions, and only the scans can decide. Name the flange, for example"
+                " --flange"
                 " iso9409-1-50-4-m6."
             )
         data = fit_flanges(data, get_flange(name), holes=False).data or data

@@ -108,7 +108,8 @@ class ProfilerFile:
         if after:
             p, w = 1e3 * np.array(after["poses"][0][:3]), after["poses"][0][3:]
             return Next(
-                f"To reduce the uncertainty, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm, rotation"
+                f"To reduce the uncertainty, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm,"
+                " rotation"
                 f" vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
             )
         return Next(

@@ -120,7 +120,8 @@ def _simulated(scenario: Scenario) -> tuple[SimulatedUr, RenderedScanner]:
     robot, scanner = scenario.robot, scenario.scanner_config()
     if not isinstance(robot, SimulatedUr) or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
         raise InputError(
-            "This study needs a simulated arm and a scanner that is fixed in the base frame. Give a scenario with robot:"
+            "This study needs a simulated arm and a scanner that is fixed in the base frame. Give a scenario with"
+            " robot:"
             " !SimulatedUr and scanner: !RenderedScanner, such as s_groove."
         )
     return robot, scanner

@@ -62,7 +62,7 @@ class TagLimits:
     depth_m: float = 2e-4  # a choice: depth is the tip's height, which the servo presses to 3 mm
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TagObservation:
     """The result of one tag detection.
 
@@ -166,23 +166,23 @@ def detect_tag(
         grey = np.asarray(cv2.undistort(grey, K, np.asarray(distortion, dtype=float)), dtype=np.uint8)
     hits = _corners(grey, tag)
     if not hits:
-        return TagObservation(False, f"Tag {tag.id} is not visible to the finger camera.")
+        return TagObservation(valid=False, reason=f"Tag {tag.id} is not visible to the finger camera.")
     if len(hits) > 1:
-        return TagObservation(False, f"Tag {tag.id} is seen {len(hits)} times; it must be unique.")
+        return TagObservation(valid=False, reason=f"Tag {tag.id} is seen {len(hits)} times; it must be unique.")
     cells = tag_cells(tag)
     sides = sides_of_square(grey, hits[0], len(cells))
     if sides is None:
         text = (
             f"A side of tag {tag.id} is covered, out of the picture or without contrast; clean the window and the tag."
         )
-        return TagObservation(False, text, None, hits[0])
+        return TagObservation(valid=False, reason=text, corners=hits[0])
     corners = sides.corners
 
     _, rotations, translations, errors = cv2.solvePnPGeneric(
         tag.corners_M, corners, K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
     if not rotations:
-        return TagObservation(False, f"No pose explains the corners of tag {tag.id}.", None, corners)
+        return TagObservation(valid=False, reason=f"No pose explains the corners of tag {tag.id}.", corners=corners)
     spread = np.nan_to_num(np.asarray(errors, dtype=float).ravel(), nan=np.inf)
     best = int(np.argmin(spread))
     if spread[best] > bounds.max_reprojection_px:
@@ -199,19 +199,29 @@ def detect_tag(
         text = (
             f"The corners of tag {tag.id} are {error:.2f} px from any pose; clean the tag or check the camera matrix."
         )
-        return TagObservation(False, text, None, corners, error)
+        return TagObservation(valid=False, reason=text, corners=corners, reprojection_px=error)
     distance = float(np.linalg.norm(position))
     if position[2] <= 0.0 or not bounds.near_m <= distance <= bounds.far_m:
         text = f"Tag {tag.id} seems {1e3 * distance:.1f} mm away, out of its range; check the tag's size."
-        return TagObservation(False, text, None, corners, error)
+        return TagObservation(valid=False, reason=text, corners=corners, reprojection_px=error)
     quality = picture_quality(grey, sides, cells, error)
     covariance = quality.covariance(position, tag.size_m, K)
     lateral, depth = LIMIT_SIGMAS * np.sqrt([np.linalg.eigvalsh(covariance[:2, :2])[1], covariance[2, 2]])
     if quality.blurred or lateral > bounds.lateral_m or depth > bounds.depth_m:
         text = f"The picture of tag {tag.id} is not sharp and even enough to measure: {quality.cause()}"
-        return TagObservation(False, text, None, corners, error, covariance, quality)
+        return TagObservation(
+            valid=False, reason=text, corners=corners, reprojection_px=error, covariance_K=covariance, quality=quality
+        )
     X_KM = pose(cv2.Rodrigues(r)[0], position)
-    return TagObservation(True, "", X_KM, corners, error, covariance, quality)
+    return TagObservation(
+        valid=True,
+        reason="",
+        X_KM=X_KM,
+        corners=corners,
+        reprojection_px=error,
+        covariance_K=covariance,
+        quality=quality,
+    )
 
 
 def deflection_from_tag(X_KM: RigidTransform, X_KM_rest: RigidTransform, R_TK: RotationMatrix) -> Array:

@@ -202,7 +202,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
     if ending in (".bag", ".db3", ".mcap"):
         raise DatasetError(
             f"'{path.name}' is a ROS recording, which is not read. Write the robot's and the camera's poses as"
-            " robot.csv and camera.csv (rostopic echo -p, or ros2 topic echo --csv) into a folder, and give that folder."
+            " robot.csv and camera.csv (rostopic echo -p, or ros2 topic echo --csv) into a folder, and give that"
+            " folder."
         )
     if ending in (".pkl", ".pickle"):
         raise DatasetError(
