@@ -43,10 +43,10 @@ class Sides:
 def sides_of_square(grey: NDArray[np.uint8], corners: Array, cells: int) -> Sides | None:
     """Locate the sides of a black square on white; None where a side is not visible.
 
-    Corner refinement looks at a few pixels round each corner, and where blur rounds the corner or the print differs on
-    its two sides they move outwards: a tag of 112 px reads half a pixel too large, which is 0.2 mm in 40 mm of
-    distance. Across a whole side the blur is symmetric: the total grey of a profile gives the position of its edge (the
-    area under a blurred step equals that of the step, whatever the blur), averaged over a hundred pixels of a side.
+    Corner refinement looks at a few pixels round each corner. Where blur rounds the corner or the print differs on
+    its two sides they move outwards. A tag of 112 px then reads half a pixel too large, which is 0.2 mm in 40 mm of
+    distance. Across a whole side the blur is symmetric. The area under a blurred step equals that of the step, so the
+    total grey of a profile gives the position of its edge, averaged over a hundred pixels of a side.
     Each profile has its own levels of black and white, so that light from one side does not move the edge.
 
     Args:

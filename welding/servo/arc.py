@@ -24,7 +24,7 @@ def way_to_rest_m(speed_m_s: float, config: ServoConfig) -> float:
 
 
 def stand(state: WeldingState, why: Stand) -> WeldingState:
-    """The state that begins to stand: its motion ramps to rest."""
+    """Return the state in which the motion begins to ramp to rest."""
     return changed(state, stand=why, stood_s=0.0, V_stop=state.V, v_tip=0.0, omega=0.0, u_n=0.0, u_a=0.0)
 
 

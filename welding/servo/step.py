@@ -323,7 +323,7 @@ def _weld(
 
 
 def _stand(state: WeldingState, V: Array, why: Stand, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """The tick in which the tool begins to stand, with the motion of this tick still."""
+    """Return the tick in which the tool begins to come to rest, with the motion of this tick still."""
     state = stand(changed(state, V=V), why)
     return _answer(state, state.V_stop, config, Diagnostics())
 
