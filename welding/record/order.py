@@ -42,7 +42,7 @@ class OrderLimits:
 
 @dataclass(kw_only=True)
 class WeldOrder:
-    """What the weld is ordered as, for its record; every key is a text of the user's own, and may be empty."""
+    """What the weld is ordered as, for its record; every key but `limits` is a free text, and may be empty."""
 
     order: str = ""  # number of the work order
     wps: str = ""  # welding procedure specification and its revision
