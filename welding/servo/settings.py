@@ -355,7 +355,8 @@ class ServoConfig:
         _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
-        check_weave(self.weave, self.weave_bounds(self.weave))
+        if self.weave.amplitude_m:
+            check_weave(self.weave, self.weave_bounds(self.weave))
 
     def weave_bounds(self, weave: WeaveConfig) -> list[Bound]:
         """The tool's limits of a weave."""
