@@ -43,8 +43,8 @@ def said_twice(printed: str) -> list[str]:
     """Poses, and lines of words, that a terminal shows more than once."""
     poses = re.findall(r"p\[.*?\]", printed)
     lines = [text for line in printed.splitlines() if len(text := re.sub(r"^ *(\S.*?)?  +|^- ", "", line).strip()) > 30]
-    # rows of two matrices are alike, and so are those of two joints
-    lines = [text for text in lines if re.search(r"[a-z]{3}", text) and not re.match(r"[-+]?\d", text)]
+    # rows of two matrices are alike, and so are those of two joints, and those of two robots in a table
+    lines = [text for text in lines if re.search(r"[a-z]{3}", text) and not re.match(r"[-+]?\d|iso9409.*   ", text)]
     return [text for found in (poses, lines) for text, count in Counter(found).items() if count > 1]
 
 

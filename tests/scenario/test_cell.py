@@ -327,7 +327,7 @@ def test_an_arm_that_stands_elsewhere_goes_home_and_then_does_its_job(tmp_path: 
 def test_an_arm_without_a_free_way_home_is_refused_before_it_moves() -> None:
     scenario = load_scenario("straight_groove", TOLD)
     robot = standing(np.deg2rad(scenario.home_deg) + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"^The arm is at \[190, -51, .*Move the arm by hand near home_deg") as refusal:
+    with pytest.raises(InputError, match=r"^The arm is at \[190, -51, .*move it by hand near home_deg") as refusal:
         build_cell(scenario, robot=robot)
     assert str(refusal.value).count(". ") == 0, "one sentence"
 

@@ -54,7 +54,7 @@ def test_verify_uses_the_field_near_the_poses(results: tuple[Path, Path], tmp_pa
     plain, local = (_error(r, new, tmp_path / r.name) for r in results)
     assert local[0] < 0.75 * plain[0]
     assert local[0] < local[1]
-    done = CliRunner().invoke(app, ["verify", str(results[1]), str(new), "--out", str(tmp_path / "cli")])
+    done = CliRunner().invoke(app, ["verify", str(results[1]), str(new), "--out", str(tmp_path / "cli"), "-v"])
     assert f"error, median {local[0]:.3f} mm (bootstrap 95 %:" in " ".join(done.output.split())
 
 
