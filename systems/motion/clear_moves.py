@@ -53,8 +53,8 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the"
-        f" surroundings or the arm itself: move it by hand near home_deg [{wanted}] first."
+        f"The arm is at [{stands}] deg, where a straight move home touches the table, the surroundings or the arm:"
+        f" move it by hand near home_deg [{wanted}] first."
     )
 
 
