@@ -308,7 +308,7 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
 
 
 def _of_second(name: str) -> str:
-    """Return the name of a port or system of the second arm, from that which its driver gave it."""
+    """Return the name of a port or system of the second arm, from the one that its driver gave it."""
     return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 

@@ -205,17 +205,22 @@ def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
     return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
 
 
-def load_correction(path: Path) -> ScannerCorrection | None:
-    """Read the scanner correction of any calibration.yaml (or the folder that holds it); None where it has none.
-
-    Raises InputError: the file is missing or no calibration, or its correction cannot be read.
-    """
+def _opened(path: Path) -> tuple[Path, Any]:
+    """Return the path of a result's file and its contents."""
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
     require_whole(path)
     if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
-    document = read_document(path)
+    return path, read_document(path)
+
+
+def load_correction(path: Path) -> ScannerCorrection | None:
+    """Read the scanner correction of any calibration.yaml (or the folder that holds it); None where it has none.
+
+    Raises InputError: the file is missing or no calibration, or its correction cannot be read.
+    """
+    path, document = _opened(path)
     if not isinstance(document, dict) or not {"X_BC", "X_FC", "scanner_correction"} & set(document):
         raise InputError(f"'{path}' is not a calibration result; give a folder written by 'weldcal calibrate'.")
     return correction_from_document(document.get("scanner_correction"), path.name)
@@ -227,12 +232,7 @@ def load_result(path: Path) -> CalibrationResult:
     Raises InputError, with the file and the key, when it is missing, not a calibration, holds a value of the wrong
     kind, or its rotation is not orthonormal.
     """
-    path = Path(path)
-    path = path / RESULT_FILE if path.is_dir() else path
-    require_whole(path)
-    if not path.exists():
-        raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
-    document = read_document(path)
+    path, document = _opened(path)
     if isinstance(document, dict) and "X_FC" in document:
         raise InputError(
             f"'{path}' is the calibration of a scanner on the flange (X_FC). Give one of a scanner beside the robot."

@@ -126,7 +126,7 @@ def _source(folder: Path, skip: set[Path]) -> Path:
 
 
 def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple[Array, str]:
-    """Find the times (n,) s of the profiles and their unit: the stated one, or that which fits the robot's stream."""
+    """Find the times (n,) s of the profiles and their unit: the stated one, or the one that fits the robot's stream."""
     times, stated = profiles.times, profiles.time_unit
     if (folder / _TIMES).is_file():
         blocks = blocks_of(read_text(folder / _TIMES), _TIMES)
