@@ -48,6 +48,9 @@ def ignore_signals() -> None:
     """Let nothing interrupt the end of the interpreter, which would put the system's own handlers back."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    # `python -m` ends by SIGINT where the last exec of a text met a KeyboardInterrupt, as a dataclass that was being
+    # made; the next exec takes the mark back (CPython, run_eval_code_obj).
+    exec("")
 
 
 def received() -> bool:

@@ -75,9 +75,11 @@ def flange_points() -> np.ndarray:
 @pytest.fixture
 def tag_camera() -> Iterator[MjpegCamera]:
     """A finger camera that sees the tag as OpenCV draws it."""
-    cells = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50).generateImageMarker(7, 112, borderBits=1)
+    cells = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50).generateImageMarker(
+        7, 114, borderBits=1
+    )  # 19 px a cell
     picture = np.full((300, 400), 200, np.uint8)
-    picture[94:206, 144:256] = np.where(cells > 0, 200, 30)
+    picture[93:207, 143:257] = np.where(cells > 0, 200, 30)
     with mjpeg_camera(30.0) as camera:
         camera.draws = lambda number: cv2.add(
             camera.blurred(picture), np.random.default_rng(number).integers(0, 4, picture.shape, dtype=np.uint8)

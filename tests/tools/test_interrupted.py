@@ -50,6 +50,15 @@ def python(body: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
+def test_a_signal_while_python_runs_a_text_keeps_the_exit_code(tmp_path: Path) -> None:
+    (tmp_path / "ends.py").write_text(
+        "import sys\nfrom weldcal.systems.interrupts import ignore_signals\n"
+        "try:\n    exec('raise KeyboardInterrupt')\nexcept KeyboardInterrupt:\n    pass\n"
+        "ignore_signals()\nsys.exit(7)\n"
+    )
+    assert subprocess.run([sys.executable, "-m", "ends"], cwd=tmp_path, check=False).returncode == 7
+
+
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_before_the_work_begins_nothing_was_written(number: str) -> None:
     ended = python(f"os.kill(os.getpid(), signal.{number}); print('goes on')", "--json")

@@ -139,7 +139,7 @@ def test_pictures_take_the_camera_of_the_same_files(tmp_path: Path, name: str) -
         (FILES["camera_info.yaml"].replace(f"width: {W}", "width: 1280"), "states a camera of 1280 x 30"),
         (FILES["camera_info.yaml"].replace(f"[{FX}", "[-1.0"), "not usable"),
         ("fx: [", "cannot be read"),
-        ("name: a camera\n", "not known"),
+        ("name: a camera\n", "intrinsics of its camera are missing"),
     ],
 )
 def test_a_camera_that_does_not_fit_is_refused_until_dataset_yaml_states_one(

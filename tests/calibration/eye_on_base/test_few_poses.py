@@ -81,7 +81,7 @@ def test_a_rotation_that_the_holes_leave_open_is_not_used() -> None:
     patterns["p1"] = replace(patterns["p1"], other_turns_rad=quarter)
     assert estimate_from_whole_poses(observations, patterns, TURN).ids == ("p0", "p2")
     patterns = {k: replace(p, other_turns_rad=quarter) for k, p in patterns.items()}
-    with pytest.raises(TooFewPoses, match=r"dowel hole, .* one of 0, 90, 180, 270 degrees"):
+    with pytest.raises(TooFewPoses, match=r"dowel hole\. .* one of 0, 90, 180, 270 degrees"):
         estimate_from_whole_poses(observations, patterns, TURN)
 
 

@@ -299,7 +299,7 @@ GROUPS = (
     *(MotionLimits, LawWeights, SteeringConfig, FeltPathConfig, ServoConfig),
 )
 SIGNED = {"torch_height_m", "side_offset_m", "offset_m", "work_angle_rad"}  # a side, or a direction
-MAY_BE_ZERO = {"tip_seat_height_m", "zero_frames", "settle_s"}
+MAY_BE_ZERO = {"tip_seat_height_m", "zero_frames", "settle_s", "start_s", "crater_s"}
 
 
 @pytest.mark.parametrize("group", GROUPS)
