@@ -81,8 +81,11 @@ def _print_all(robots: list[Robot]) -> None:
         )
     screen = Console()
     screen.print(table)
-    screen.print("-: not in a public source. dowel: degrees about the tool's z, from x. repeat: repeatability, plus or minus."
-        " inverse: how the inverse kinematics is solved.", highlight=False)
+    screen.print(
+        "-: not in a public source. dowel: degrees about the tool's z, from x. repeat: repeatability, plus or minus."
+        " inverse: how the inverse kinematics is solved.",
+        highlight=False,
+    )
     screen.print(
         "weldcal robots NAME shows one robot, joint by joint, with the source of each number.", highlight=False
     )
