@@ -19,6 +19,7 @@ from weldcal.systems.drivers.config import NoDevice, check_range
 from weldcal.systems.jobs.job import job_of, jobs
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
+from weldcal.welding.locate.part.joint import SHOWN_BY
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
@@ -238,6 +239,24 @@ def check_refinement(scenario: Scenario) -> None:
         )
 
 
+def check_schedule(scenario: Scenario) -> None:
+    """Check the welding schedule.
+
+    Raises:
+        InputError: an invalid value, or a table by gap for a seam whose gap is not measured.
+    """
+    schedule, spec = scenario.welding.schedule, scenario.workpiece
+    if schedule is None:
+        return
+    schedule.check(scenario.welding.arc.crater_s)
+    measured = spec is not None and spec.file is not None and spec.located_by == "scan"
+    if schedule.by_gap and not (measured and spec is not None and "gap" in SHOWN_BY.get(spec.joint or "", ())):
+        raise InputError(
+            "welding.schedule.by_gap needs a joint whose gap is measured in the scan: a butt, fillet or lap of a part"
+            " from a file (workpiece.file, located_by: scan)."
+        )
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -267,6 +286,7 @@ def check_scenario(scenario: Scenario) -> None:
     scenario.welding.process.process()
     scenario.welding.order.check()
     scenario.welding.arc.check(scenario.robot.reports_arc)
+    check_schedule(scenario)
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")

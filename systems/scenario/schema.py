@@ -17,6 +17,7 @@ from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
@@ -223,6 +224,7 @@ class WeldingConfig:
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
+    schedule: WeldSchedule | None = None  # null: no set values; the power source is set by hand
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
