@@ -14,7 +14,10 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
 
-DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe")
+DEVICES = (
+    *("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe"),
+    "power_source",
+)
 """The devices of a station, by their key in the scenario; drivers are applied in this order."""
 
 
@@ -43,7 +46,7 @@ class DriverConfig:
 
     @property
     def reports_arc(self) -> bool:
-        """Whether a robot's driver reports the arc of its power source."""
+        """Whether a driver of a robot or of a power source reports the arc."""
         return False
 
     def torch_delay_s(self) -> float:

@@ -246,6 +246,8 @@ def check_schedule(scenario: Scenario) -> None:
         InputError: an invalid value, or a table by gap for a seam whose gap is not measured.
     """
     schedule, spec = scenario.welding.schedule, scenario.workpiece
+    if scenario.robot.reports_arc and scenario.power_source.reports_arc:
+        raise InputError("robot.arc_input and power_source both report the arc: leave out robot.arc_input.")
     if schedule is None:
         return
     schedule.check(scenario.welding.arc.crater_s)
@@ -285,7 +287,7 @@ def check_scenario(scenario: Scenario) -> None:
         )
     scenario.welding.process.process()
     scenario.welding.order.check()
-    scenario.welding.arc.check(scenario.robot.reports_arc)
+    scenario.welding.arc.check(scenario.reports_arc)
     check_schedule(scenario)
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":

@@ -289,6 +289,7 @@ class Scenario:
     digitizer: DriverConfig = dc.field(default_factory=NoDevice)
     profiler: DriverConfig = dc.field(default_factory=NoDevice)
     touch_probe: DriverConfig = dc.field(default_factory=NoDevice)
+    power_source: DriverConfig = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
@@ -306,6 +307,11 @@ class Scenario:
     def table_height_m(self) -> float:
         """Height of the table over the base's origin, against gravity, m."""
         return self.calibration.table_z_m - self.base.xyz_m[2]
+
+    @property
+    def reports_arc(self) -> bool:
+        """Whether robot or power source report the arc."""
+        return self.robot.reports_arc or self.power_source.reports_arc
 
     @property
     def welds(self) -> bool:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class WeldSchedule:
 
     def check(self, crater_s: float = 0.0) -> None:
         """Raise ScheduleError for values that cannot be used; `crater_s`: how long the torch stands at the end."""
-        parts = {"": self, "hot_start.": self.hot_start, "crater.": self.crater}
+        parts: dict[str, Any] = {"": self, "hot_start.": self.hot_start, "crater.": self.crater}
         parts |= {f"by_gap[{k}].": row for k, row in enumerate(self.by_gap)}
         for place, part in parts.items():
             for name in VALUES if part is not None else ():
