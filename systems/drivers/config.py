@@ -13,6 +13,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
+from weldcal.welding.record.schedule import WeldSchedule
 
 DEVICES = (
     *("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe"),
@@ -48,6 +49,9 @@ class DriverConfig:
     def reports_arc(self) -> bool:
         """Whether a driver of a robot or of a power source reports the arc."""
         return False
+
+    def check_schedule(self, schedule: WeldSchedule) -> None:
+        """Check that the driver can set the values of a schedule. Raises InputError."""
 
     def torch_delay_s(self) -> float:
         """Time from the command of the torch to the torch, s, such as for the shielding gas."""

@@ -251,6 +251,8 @@ def check_schedule(scenario: Scenario) -> None:
     if schedule is None:
         return
     schedule.check(scenario.welding.arc.crater_s)
+    scenario.power_source.check_schedule(schedule)
+    scenario.robot.check_schedule(schedule)
     measured = spec is not None and spec.file is not None and spec.located_by == "scan"
     if schedule.by_gap and not (measured and spec is not None and "gap" in SHOWN_BY.get(spec.joint or "", ())):
         raise InputError(

@@ -97,7 +97,9 @@ class WeldSchedule:
         missing = [n for part in (self.hot_start, self.crater) if part for n in VALUES if getattr(part, n) is not None]
         for name in missing:
             if name not in given:
-                raise ScheduleError(f"welding.schedule.{name} is missing: hot start or crater has one, the run has none.")
+                raise ScheduleError(
+                    f"welding.schedule.{name} is missing: hot start or crater has one, the run has none."
+                )
 
     def _check_rows(self) -> None:
         rows = self.by_gap

@@ -375,7 +375,9 @@ def _add_welding(
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
     more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
-    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, more, scenario.welding.schedule))
+    servo = wiring.add(
+        "welding_servo", WeldingVelocityServo(station.arm, tool, config, more, scenario.welding.schedule)
+    )
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),

@@ -52,9 +52,7 @@ class ServoReport(Message):
         return self.interruption.way_back_m
 
 
-def at_gap(
-    config: ServoConfig, schedule: WeldSchedule, gap: GapAlong | None, state: WeldingState
-) -> ServoConfig:
+def at_gap(config: ServoConfig, schedule: WeldSchedule, gap: GapAlong | None, state: WeldingState) -> ServoConfig:
     """The settings with the schedule's speed for the gap beside the torch; before the touch with its largest speed."""
     speeds = schedule.speeds_m_s()
     if gap is None or not speeds:

@@ -5,14 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from weldcal.welding.record.schedule import (
-    Crater,
-    GapRow,
-    HotStart,
-    ScheduleError,
-    WeldSchedule,
-    gap_along,
-)
+from weldcal.welding.record.schedule import Crater, GapRow, HotStart, ScheduleError, WeldSchedule, gap_along
 
 STAGES = WeldSchedule(
     wire_feed_m_min=8.0,
@@ -23,9 +16,7 @@ STAGES = WeldSchedule(
 # a row each 0.5 mm, none on a straight line with its neighbours
 ROWS = [(0.0, 8.0, 24.0, 8.0), (0.5, 8.2, 23.6, 7.6), (1.0, 8.7, 23.4, 7.0), (1.5, 8.8, 22.6, 6.7),
         (2.0, 9.4, 22.3, 6.0), (2.5, 9.6, 21.4, 5.6), (3.0, 10.4, 21.0, 5.0)]  # fmt: skip
-TABLE = WeldSchedule(
-    by_gap=[GapRow(gap_mm=g, wire_feed_m_min=w, voltage_V=u, speed_mm_s=v) for g, w, u, v in ROWS],
-)
+TABLE = WeldSchedule(by_gap=[GapRow(gap_mm=g, wire_feed_m_min=w, voltage_V=u, speed_mm_s=v) for g, w, u, v in ROWS])
 
 
 @pytest.mark.parametrize(
