@@ -50,8 +50,13 @@ class DriverConfig:
         """Whether a driver of a robot or of a power source reports the arc."""
         return False
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """The set values of the power source that the driver passes on: names of schedule.VALUES, and job."""
+        return ()
+
     def check_schedule(self, schedule: WeldSchedule) -> None:
-        """Check that the driver can set the values of a schedule. Raises InputError."""
+        """Check that the driver can set each value of a schedule that it takes. Raises InputError."""
 
     def torch_delay_s(self) -> float:
         """Time from the command of the torch to the torch, s, such as for the shielding gas."""

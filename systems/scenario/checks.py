@@ -20,6 +20,7 @@ from weldcal.systems.jobs.job import job_of, jobs
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
 from weldcal.welding.locate.part.joint import SHOWN_BY
+from weldcal.welding.record.schedule import VALUES
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
@@ -251,8 +252,15 @@ def check_schedule(scenario: Scenario) -> None:
     if schedule is None:
         return
     schedule.check(scenario.welding.arc.crater_s)
-    scenario.power_source.check_schedule(schedule)
-    scenario.robot.check_schedule(schedule)
+    taken = {*scenario.power_source.takes, *scenario.robot.takes}
+    wanted = [name for name in VALUES if schedule.extremes(name)] + ["job"] * (schedule.job is not None)
+    if missing := [name for name in wanted if name not in taken]:
+        raise InputError(
+            f"welding.schedule sets {missing[0]}, and nothing passes it on: write power_source with a register for it,"
+            " or wire robot.wire_feed and robot.arc_voltage."
+        )
+    for driver in (scenario.power_source, scenario.robot):
+        driver.check_schedule(schedule)
     measured = spec is not None and spec.file is not None and spec.located_by == "scan"
     if schedule.by_gap and not (measured and spec is not None and "gap" in SHOWN_BY.get(spec.joint or "", ())):
         raise InputError(

@@ -60,18 +60,16 @@ class ModbusPowerSource(DriverConfig):
         check_range("power_source.ignition_s", self.ignition_s, 0.0, 10.0)
         return load_register_map(self.map)
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """See DriverConfig."""
+        return tuple(name for name in NAMES if name in self.checked().set)
+
     def check_schedule(self, schedule: WeldSchedule) -> None:
         """See DriverConfig."""
-        registers = self.checked()
-        values = {name: schedule.extremes(name) for name in VALUES}
-        for name, given in {"job": () if schedule.job is None else (float(schedule.job),), **values}.items():
-            register = registers.set.get(name)
-            if given and register is None:
-                raise InputError(
-                    f"welding.schedule sets {name}, and the register map {self.map} has no register for it: leave it"
-                    " out, or add it to the map."
-                )
-            wrong = [value for value in given if register is not None and not register.holds(value)]
+        for name, register in self.checked().set.items():
+            given = (schedule.job,) if name == "job" else schedule.extremes(name) if name in VALUES else ()
+            wrong = [value for value in given if value is not None and not register.holds(value)]
             if wrong:
                 raise InputError(f"welding.schedule: {name} {wrong[0]:g} is out of the range of the map {self.map}.")
 

@@ -11,6 +11,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.drivers.config import DriverConfig, check_range
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
+from weldcal.welding.record.schedule import VALUES
 
 PERIOD_S = 0.008  # two periods of the commands: a real source reports no faster
 # Melting of a 1.2 mm plain steel wire: feed = alpha I + beta (stick-out) I^2; J. Norrish, Advanced Welding Processes
@@ -37,6 +38,11 @@ class SimulatedPowerSource(DriverConfig):
     def reports_arc(self) -> bool:
         """See DriverConfig."""
         return True
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """See DriverConfig."""
+        return ("job", *VALUES)
 
     def torch_delay_s(self) -> float:
         """See DriverConfig."""
