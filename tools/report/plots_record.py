@@ -41,7 +41,7 @@ def arc_over_time(record: WeldRecord, rows: NDArray[np.bool_], limits: OrderLimi
             ax.plot(t, wanted, color=TORCH, lw=1.2, ls="--", label="set")
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, 0.0) if name.startswith(("travel", "gap")) else low, high)
-        ax.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="lower right")
+        ax.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="lower center")
         plain(ax, "", name)
     axes[-1, 0].set_xlabel("time from the established arc, s")
     return svg(figure, *axes[:, 0])

@@ -64,7 +64,8 @@ class PartRecord:
     def outside(self) -> list[str]:
         """A sentence for each limit that a seam exceeds."""
         return [
-            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
+            f" {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -95,8 +96,10 @@ class PartRecord:
         if process.missing is None:
             name, k = process.name or "not named", process.k
             found.append(("process", f"{name}, {process.current_A:g} A, {process.voltage_V:g} V as set; k = {k:g}"))
-        elif MEASURED not in sources:
+        elif UNKNOWN in sources or not sources:
             return [*found, ("heat input", f"not known: {process.missing}")]
+        else:
+            found.append(("process", f"{process.name or 'not named'}; k = {fixed(process.k, 2)}"))
         return [*found, ("arc values", "; ".join(_SOURCES[source] for source in sorted(sources)))]
 
     def write(self, folder: Path) -> None:
@@ -123,6 +126,7 @@ class PartRecord:
             "order": self.order.document(),
             "outside_limits": self.outside,
             "process": asdict(self.log.process),
+            "schedule": self.log.settings.get("schedule"),
             "seams": [
                 asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
                 for seam, row in zip(self.seams, rows, strict=True)
@@ -130,6 +134,15 @@ class PartRecord:
         }
         write_json(folder / RECORD_JSON, document)
         write_atomic(folder / RECORD_HTML, self.page(written))
+
+    def _ends_of(self, seam: int) -> bytes | None:
+        """The pictures of a seam's start and end side by side, PNG; None without them."""
+        names = [f"seam_{seam}_{end}" for end in ENDS]
+        grey = [cv2.imdecode(np.frombuffer(self.pictures[n], np.uint8), 0) for n in names if n in self.pictures]
+        found = [np.pad(one, ((0, 0), (0, 8)), constant_values=255) for one in grey if one is not None]
+        tall = max((len(one) for one in found), default=0)
+        row = [np.pad(one, ((0, tall - len(one)), (0, 0)), constant_values=255) for one in found]
+        return cv2.imencode(".png", np.hstack(row))[1].tobytes() if row else None
 
     def page(self, written: str) -> str:
         """The record as one self-contained HTML text."""
@@ -150,6 +163,7 @@ class PartRecord:
             record=self,
             order=self.order,
             plots=self.plots,
+            pictures={seam.seam: picture for seam in self.seams if (picture := self._ends_of(seam.seam)) is not None},
             cards=cards,
             written=written.replace("T", " ").replace("+00:00", " UTC"),
             simulated=self.log.settings.get("robot") == "simulated",

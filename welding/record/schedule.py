@@ -15,6 +15,8 @@ VALUES = ("wire_feed_m_min", "voltage_V", "current_A")
 LARGEST = {"wire_feed_m_min": 50.0, "voltage_V": 100.0, "current_A": 2000.0}  # a choice: beyond any arc welding source
 LARGEST_GAP_MM = 10.0  # a choice: wider joints are not welded in one run
 LONGEST_STAGE_S = 10.0  # a choice: as an arc that stands
+LEAST_SIGMA_M = 1e-5  # of a gap: a hundredth of what any scan shows
+SMOOTH_M = 0.020  # a choice: two windows of the fit-up; the gap of two plates changes more slowly
 BEYOND_SIGMAS = 2.0  # a choice: of the gap's sigma, by which a gap may pass the table's last row
 
 
@@ -180,7 +182,7 @@ def _check_value(key: str, value: float | None, most: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class GapAlong:
-    """The measured gap along a planned seam: places (N,) m, rising, and gaps (N,) m."""
+    """The gap along a planned seam, smoothed: places (N,) m, rising, and gaps (N,) m."""
 
     s_m: Array
     gap_m: Array
@@ -191,7 +193,7 @@ class GapAlong:
 
 
 def gap_along(s_m: Array, gap_m: Array | None, sigma_m: Array | None, schedule: WeldSchedule) -> GapAlong:
-    """The gap along a seam, for a schedule with a table by gap.
+    """The gap along a seam, for a schedule with a table by gap: lines fitted to the places around each.
 
     Args:
         s_m: (N,) places along the seam; gap_m, sigma_m: (N,) measured, NaN where the scan does not show it; None:
@@ -206,12 +208,25 @@ def gap_along(s_m: Array, gap_m: Array | None, sigma_m: Array | None, schedule: 
             "The scan does not show the joint's gap, which welding.schedule.by_gap follows: scan it from another side,"
             " or remove by_gap."
         )
-    last = 1e-3 * schedule.by_gap[-1].gap_mm
-    over = np.where(good, gap_m - last - BEYOND_SIGMAS * np.nan_to_num(sigma_m), -math.inf)
+    last, s = 1e-3 * schedule.by_gap[-1].gap_mm, s_m[good]
+    gap, sigma = _smoothed(s, gap_m[good], np.maximum(sigma_m[good], LEAST_SIGMA_M))
+    over = gap - last - BEYOND_SIGMAS * sigma
     k = int(np.argmax(over))
     if over[k] > 0.0:
         raise ScheduleError(
-            f"At {1e3 * s_m[k]:.0f} mm of the seam the gap is {1e3 * gap_m[k]:.2f} mm, and the last row of"
+            f"At {1e3 * s[k]:.0f} mm of the seam the gap is {1e3 * gap[k]:.2f} mm, and the last row of"
             f" welding.schedule.by_gap is for {1e3 * last:g} mm. Fit the parts anew, or add a row."
         )
-    return GapAlong(s_m[good], gap_m[good])
+    return GapAlong(s, np.maximum(gap, 0.0))
+
+
+def _smoothed(s: Array, value: Array, sigma: Array) -> tuple[Array, Array]:
+    """At each place the line that fits the values (N,) around it best, and its standard deviation (N,)."""
+    found = []
+    for at in s:
+        weight = np.exp(-0.5 * ((s - at) / SMOOTH_M) ** 2) / sigma
+        A = np.column_stack([np.ones(len(s)), s - at])
+        rows = np.linalg.pinv(A * weight[:, None])[0] * weight  # of the value at this place
+        found.append((rows @ value, np.linalg.norm(rows * sigma)))
+    gap, spread = np.array(found).T
+    return gap, spread
