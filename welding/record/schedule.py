@@ -16,6 +16,7 @@ LARGEST = {"wire_feed_m_min": 50.0, "voltage_V": 100.0, "current_A": 2000.0}  # 
 LARGEST_GAP_MM = 10.0  # a choice: wider joints are not welded in one run
 LONGEST_STAGE_S = 10.0  # a choice: as an arc that stands
 LEAST_SIGMA_M = 1e-5  # of a gap: a hundredth of what any scan shows
+SLOPE = 0.02  # a prior: 3 mm along 150 mm, beyond the gaps that are welded
 SMOOTH_M = 0.020  # a choice: two windows of the fit-up; the gap of two plates changes more slowly
 BEYOND_SIGMAS = 2.0  # a choice: of the gap's sigma, by which a gap may pass the table's last row
 
@@ -225,8 +226,9 @@ def _smoothed(s: Array, value: Array, sigma: Array) -> tuple[Array, Array]:
     found = []
     for at in s:
         weight = np.exp(-0.5 * ((s - at) / SMOOTH_M) ** 2) / sigma
-        A = np.column_stack([np.ones(len(s)), s - at])
-        rows = np.linalg.pinv(A * weight[:, None])[0] * weight  # of the value at this place
+        A = np.column_stack([np.ones(len(s)), s - at]) * weight[:, None]
+        A = np.vstack([A, [0.0, 1.0 / SLOPE]])
+        rows = np.linalg.pinv(A)[0, :-1] * weight  # of the value at this place
         found.append((rows @ value, np.linalg.norm(rows * sigma)))
     gap, spread = np.array(found).T
     return gap, spread

@@ -88,7 +88,7 @@ def test_noise_of_a_coarse_scan_is_smoothed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap_mm", "words"), [([2.9, 3.5, 4.1], "At 30 mm of the seam the gap is 4.10 mm"), ([math.nan] * 3, "not show")]
+    ("gap_mm", "words"), [([2.9, 3.5, 4.1], "At 30 mm of the seam the gap is 4.03 mm"), ([math.nan] * 3, "not show")]
 )
 def test_a_gap_without_a_row_is_refused(gap_mm: list[float], words: str) -> None:
     with pytest.raises(ScheduleError, match=words):
