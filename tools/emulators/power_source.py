@@ -57,14 +57,16 @@ class PowerSourceEmulator:
         answer; refuses: a Modbus exception code for all requests; requests: function codes of all requests so far.
     """
 
-    def __init__(self, registers: RegisterMap, arc: SimulatedPowerSource | None = None, port: int = 0) -> None:
+    def __init__(
+        self, registers: RegisterMap, arc: SimulatedPowerSource | None = None, host: str = "127.0.0.1", port: int = 0
+    ) -> None:
         self.registers, self._arc = registers, arc or SimulatedPowerSource(noise=0.0)
         self.holding = [0] * SIZE
         self.error, self.silent, self.refuses = 0.0, False, 0
         self.requests: list[int] = []
         self._lit_since: float | None = None
         self._toggled_at, self._toggle = time.monotonic(), 0.0
-        self._server = _Server(("127.0.0.1", port), _Connection)
+        self._server = _Server((host, port), _Connection)
         self._server.emulator = self
 
     @property
@@ -79,6 +81,12 @@ class PowerSourceEmulator:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._server.shutdown()
         self._server.server_close()
+
+    @staticmethod
+    def serve(registers: RegisterMap, host: str, port: int) -> None:
+        """Serve until the process ends."""
+        with PowerSourceEmulator(registers, host=host, port=port):
+            threading.Event().wait()
 
     def set_value(self, name: str) -> float:
         """The set value that it has got, by a name of SET."""

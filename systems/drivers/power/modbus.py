@@ -36,8 +36,8 @@ class ModbusPowerSource(DriverConfig):
 
     FOR: ClassVar[tuple[str, ...]] = ("power_source",)
 
-    host: str = ""
-    port: int = 502
+    host: str = ""  # address of its interface
+    port: int = 502  # of Modbus TCP
     unit: int = 1  # unit identifier of the requests
     map: str = dc.field(default="kemppi_dcm", metadata={"file": True})  # register map: of the package, or a YAML file
     ignition_s: float = 0.5  # from the torch to the arc at most, with gas pre-flow, on top of the usual 2 s
@@ -172,7 +172,7 @@ class PowerLink:
     def close(self) -> None:
         """See SelfTestingDevice: the arc off, then the connection."""
         self._ends = True
-        self._thread.join(2.0)
+        self._thread.join(3.0)
 
 
 class ModbusPowerSourcePorts(LeafSystem):

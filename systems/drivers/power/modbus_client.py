@@ -35,7 +35,7 @@ class ModbusClient:
         ModbusError: nothing listens there.
     """
 
-    def __init__(self, host: str, port: int = 502, unit: int = 1, timeout_s: float = 0.5) -> None:
+    def __init__(self, host: str, port: int = 502, unit: int = 1, timeout_s: float = 2.0) -> None:
         self.where, self._unit, self._number = f"{host}:{port}", unit, 0
         try:
             self._socket = socket.create_connection((host, port), timeout_s)

@@ -26,7 +26,7 @@ class Register:
 
     Attributes:
         address: as sent, from 0 on.
-        bit, width: lowest bit of the value in the register, from 0 on, and number of its bits; None: the whole register.
+        bit, width: lowest bit of the value in the register, and number of its bits; None: the whole register.
         scale, offset: value of one raw unit, and value at 0.
         least, most: of the set value, in its unit; what is beyond is refused before the job.
         signed: the raw number is in two's complement.

@@ -111,7 +111,7 @@ class Level:
     share: float
 
     def wanted(self, shares: Sequence[float] | Array | None) -> float:
-        """Return the share that the output is to have: of (2,) `shares` its own, or the scenario's where that is NaN."""
+        """Return the share that the output is to have: of `shares` (2,) its own; where that is NaN, the scenario's."""
         found = math.nan if shares is None else float(shares[self.output])
         return self.share if math.isnan(found) else min(max(found, 0.0), 1.0)
 
