@@ -53,8 +53,10 @@ class PowerSourceEmulator:
     """A power source on loopback; a context that serves while it is entered.
 
     Attributes:
-        holding: its holding registers; error: the number that it reports; silent: it takes requests and does not
-        answer; refuses: a Modbus exception code for all requests; requests: function codes of all requests so far.
+        holding: its holding registers.
+        error: the number that it reports.
+        silent: whether it takes requests without an answer. refuses: an exception code for all requests.
+        requests: function codes of all requests so far.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ class HotStart:
 
 @dataclass(kw_only=True)
 class Crater:
-    """The values at the seam's end, while the torch stands there for welding.arc.crater_s."""
+    """The values at the seam's end, while the torch waits there for welding.arc.crater_s."""
 
     wire_feed_m_min: float | None = None
     voltage_V: float | None = None
@@ -78,7 +78,7 @@ class WeldSchedule:
     by_gap: list[GapRow] = field(default_factory=list)  # by rising gap_mm, in place of the run's values
 
     def check(self, crater_s: float = 0.0) -> None:
-        """Raise ScheduleError for values that cannot be used; `crater_s`: how long the torch stands at the end."""
+        """Raise ScheduleError for values that cannot be used; `crater_s`: how long the torch waits at the end."""
         parts: dict[str, Any] = {"": self, "hot_start.": self.hot_start, "crater.": self.crater}
         parts |= {f"by_gap[{k}].": row for k, row in enumerate(self.by_gap)}
         for place, part in parts.items():
@@ -92,7 +92,7 @@ class WeldSchedule:
                     raise ScheduleError(f"welding.schedule.{place}.{name} must be from 0 to {LONGEST_STAGE_S:g}.")
         if self.crater is not None and crater_s < max(self.crater.ramp_s, 1e-3):
             raise ScheduleError(
-                "welding.schedule.crater needs a torch that stands at the end at least as long as its ramp: raise"
+                "welding.schedule.crater needs a torch that waits at the end at least as long as its ramp: raise"
                 " welding.arc.crater_s."
             )
         self._check_rows()

@@ -146,9 +146,7 @@ def load_register_map(name: str) -> RegisterMap:
             raise InputError(f"{path.name}: '{part}' holds registers by the names {', '.join(names)}.")
         parts[part] = {key: _register(f"{path.name}: {part}.{key}", value, key) for key, value in given.items()}
     if "arc_established" not in parts["shown"]:
-        raise InputError(
-            f"{path.name}: shown.arc_established is missing: without it nothing tells whether an arc burns."
-        )
+        raise InputError(f"{path.name}: shown.arc_established is missing: the weld waits for the arc.")
     fixed = document.get("fixed") or []
     found = RegisterMap(
         name=str(document.get("name") or path.stem),
