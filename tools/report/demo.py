@@ -26,6 +26,7 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     after_hold,
     refused_note,
+    typed,
     upper,
     work_point_error,
     work_point_expected,
@@ -123,7 +124,7 @@ class DemoResult:
             "the expected error at the work point, one sigma,",
             1e3 * status.predicted_error_m,
             c.required_error_mm,
-            "calibration.required_error_mm",
+            "calibration.required_error_mm, one sigma too; with 95 % probability see below",
         )
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
@@ -186,13 +187,15 @@ class DemoResult:
             return after_hold(
                 self.run.ended_by_operator,
                 "Look for the cause in scans and weld, remove it, then run the job again.",
-                f"weldcal doctor {folder}",
+                typed("doctor", folder),
             )
         if self.weld is not None and robot:
-            return Next("Look at the weld and at its log, weld.csv.", f"weldcal view {folder}")
+            return Next("Look at the weld and at its log, weld.csv.", typed("view", folder))
         if self.weld is not None:
-            return Next("See it again; then try your own part.", f"weldcal view {folder}")
-        return Next("Verify with scans that the calibration has not seen.", f"weldcal verify {folder} NEW_SCANS")
+            part = self.run.cell.scenario.workpiece
+            own = part is not None and part.file is not None
+            return Next(f"See it again{'' if own else '; then try your own part'}.", typed("view", folder))
+        return Next("Verify with scans that the calibration has not seen.", typed("verify", folder, "NEW_SCANS"))
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
