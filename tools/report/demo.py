@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
@@ -421,6 +422,16 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     return svg(picture)
 
 
+NEXT_SEAM_S = 0.5  # a choice: rows of one seam are 8 ms apart, and between two seams the arm goes home
+
+
+def broken(values: Array, at: NDArray[np.intp]) -> Array:
+    """Return a copy (N, ...) with NaN in the rows ``at``: a line that is drawn through it has a gap there."""
+    found = np.array(values, dtype=float)
+    found[at] = np.nan
+    return found
+
+
 def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     """Return the weld for the pictures, over the planned seam; y of the base is drawn to the right, as in the cell."""
     log, named = weld.log, weld.log.telemetry
@@ -430,14 +441,18 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     if weld.planned is not None:
         up = weld.planned.up(named["s_torch"])
         work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.torch.work_angle_rad))
-    errors = [None if e is None else (e.s, e.lateral, e.height) for e in (weld.plan_error, weld.error)]
+    errors = [
+        None if e is None else (broken(e.s, np.flatnonzero(np.diff(e.s) < 0.0) + 1), e.lateral, e.height)
+        for e in (weld.plan_error, weld.error)
+    ]
+    legs = np.flatnonzero(np.diff(log.time[keep]) > NEXT_SEAM_S) + 1
     return WeldTrace(
-        s=named["s_torch"][keep],
+        s=broken(named["s_torch"][keep], legs),
         torch_on=log.torch_on[keep],
         felt=named["phase"][keep] == list(Phase).index(Phase.TRACK),
-        tip=log.p_BTip[keep],
-        torch=log.p_BTorch[keep],
-        robot=log.p_BRobot[keep],
+        tip=broken(log.p_BTip[keep], legs),
+        torch=broken(log.p_BTorch[keep], legs),
+        robot=broken(log.p_BRobot[keep], legs),
         planned=_line(weld.planned),
         true=_line(weld.true_seam),
         plan_error=errors[0],
