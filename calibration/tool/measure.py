@@ -27,6 +27,7 @@ FALSE_ALARM = 1e-3  # chance that a part that has not moved is said to have
 _WIDE_M = 0.03  # a choice: no nozzle is wider, and no bend moves one out of it
 _BESIDE_M = 0.006  # a choice: of the tip's ball, beyond its radius
 _RING_M = 0.03  # a choice: where the ring is looked for
+_BALL_M = 2e-5  # a choice, per axis: what the outline's pixels do to a ball of some ten of them
 _PROFILE_M = 1e-3  # of the nozzle's wall, about its radius
 _FEWEST_DEG = 120.0  # a choice: of the circle about the nozzle
 
@@ -182,7 +183,11 @@ def measure_tool(
     across = np.array([u, v])
     moves = [
         Move(
-            "nozzle", p_FN - p_file, across.T @ C[:2, :2] @ across, across @ (a - axis_file * (a @ axis_file)), C[2:, 2:]
+            "nozzle",
+            p_FN - p_file,
+            across.T @ C[:2, :2] @ across,
+            across @ (a - axis_file * (a @ axis_file)),
+            C[2:, 2:],
         )
     ]
     wire = None
@@ -195,7 +200,8 @@ def measure_tool(
         notes.append("The wire was not touched: its end along the nozzle is that of the tool file.")
     ball = _ball(tool, scans, covariance, notes)
     if ball is not None:
-        moves.append(Move("tip", ball.surface.centre - tool.tool.X_FT.translation(), ball.covariance))
+        vague = ball.covariance + _BALL_M**2 * np.eye(3)
+        moves.append(Move("tip", ball.surface.centre - tool.tool.X_FT.translation(), vague))
     if ring is not None:
         X_FR = tool.tool.X_FR
         z = X_FR.rotation().matrix()[:, 2]
@@ -232,9 +238,7 @@ def _stick_out(nozzle: Nozzle, points: Array, p_FW: Array) -> tuple[float, float
     return float((p_FW - nozzle.centre) @ nozzle.axis) - mouth, sigma
 
 
-def _ball(
-    tool: LoadedTool, scans: Sequence[ToolScan], covariance: Array, notes: list[str]
-) -> SurfaceFit[Ball] | None:
+def _ball(tool: LoadedTool, scans: Sequence[ToolScan], covariance: Array, notes: list[str]) -> SurfaceFit[Ball] | None:
     t = tool.tool
     axis = -t.X_FT.rotation().matrix()[:, 2]
     start = Ball(np.array(t.X_FT.translation()), t.tip_radius_m, axis, t.tip_radius_m + _BESIDE_M)

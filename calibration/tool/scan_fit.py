@@ -82,7 +82,8 @@ def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: st
     shift, turn, noise = 1e-4, 1e-3, 1e-4  # starts, m, rad, m
     n = len(seen)
     total = P + 6 + 6 * n
-    C, rows, x_nuisance = np.eye(total), None, np.zeros(total - P)
+    x_nuisance: Array = np.zeros(total - P)
+    C, rows = np.eye(total), None
     for step in range(STEPS):
         rows, scale = _rows(surface, seen, x_nuisance, scale)
         if len(rows.e) < P + FEWEST_CELLS:
@@ -114,8 +115,7 @@ def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: st
         if step > 8 and float(np.abs(x[:4]).max()) < 1e-6:
             break
     assert rows is not None
-    freedom = max(2 * n - 4, 2)
-    widened = 2.0 * f_quantile(0.95, 2, freedom) / chi2_quantile(0.95, 2)
+    widened = 3.0 * f_quantile(0.95, 3, max(2 * n - 4, 2)) / chi2_quantile(0.95, 3)
     return SurfaceFit(
         surface=surface, covariance=widened * C[:P, :P], points=rows.on, noise_m=noise, scans=n, cells=len(rows.e)
     )

@@ -155,7 +155,7 @@ class Nozzle:
     def mouth(self, p: Array, within_m: float) -> tuple[float, float]:
         """Return where the nozzle ends, m along the axis from its middle, and the sigma of that.
 
-        The last point of each strip along the axis lies up to one point's spacing before the end.
+        The noise of the last points of each strip along the axis makes up for their spacing from the end.
         """
         s, r, away = self._round(p)
         end_radius = self.radii[-1]
@@ -171,7 +171,7 @@ class Nozzle:
             return float("nan"), float("nan")
         gap = float(np.median(gaps))
         spread = float(np.median(np.abs(np.array(last) - np.median(last)))) * 1.4826  # MAD to a deviation
-        return float(np.median(last)) + 0.5 * gap, max(spread, gap)
+        return float(np.median(last)), max(spread, gap)
 
 
 @dataclass(frozen=True, eq=False)

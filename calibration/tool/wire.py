@@ -98,16 +98,14 @@ def find_wire(
     if len(touches) < 4:
         raise ToolNotFound(f"{len(touches)} touches are too few: touch in four orientations or more.")
     best = _solved(touches, p_FW, axis, wire_m, normal)
-    alone = [_solved([t for t in touches if t is not out], p_FW, axis, wire_m, normal) for out in touches]
-    usable = [(a.square, k) for k, a in enumerate(alone) if a.freedom > 0]
+    k = int(np.argmax(best.squares))
+    alone = _solved([t for t in touches if t is not touches[k]], p_FW, axis, wire_m, normal)
     left_out: tuple[str, ...] = ()
-    if usable and best.freedom > 0:
-        square, k = min(usable)
-        paid = best.freedom - alone[k].freedom
-        if paid > 0 and square > 0.0:
-            gain = (best.square - square) / paid / max(square / alone[k].freedom, _NOISE_M**2)
-            if float(f_tail(gain, paid, alone[k].freedom)) * len(touches) < _CHANCE:
-                best, left_out = alone[k], (touches[k].id,)
+    paid = best.freedom - alone.freedom
+    if paid > 0 and alone.freedom > 0:
+        gain = (best.square - alone.square) / paid / max(alone.square / alone.freedom, _NOISE_M**2)
+        if float(f_tail(gain, paid, alone.freedom)) * len(touches) < _CHANCE:
+            best, left_out = alone, (touches[k].id,)
     if best.freedom < 1:
         raise ToolNotFound("The touches only just determine the wire's end: add touches, so that an error shows.")
     variance = max(best.square / best.freedom, _NOISE_M**2)
@@ -132,8 +130,13 @@ def find_wire(
 class _Solution:
     p_FW: Array
     C: Array  # (3, 3) for unit variance
-    square: float  # sum of squares, m^2
+    squares: Array  # (touches,) m^2
     freedom: int
+
+    @property
+    def square(self) -> float:
+        """Sum of squares, m^2."""
+        return float(self.squares.sum())
 
 
 def _solved(touches: Sequence[WireTouch], p: Array, axis: Array, wire_m: float, normal: Array) -> _Solution:
@@ -145,7 +148,7 @@ def _solved(touches: Sequence[WireTouch], p: Array, axis: Array, wire_m: float, 
     }
     planes = dict.fromkeys(targets, normal / np.linalg.norm(normal))
     size = 3 + 3 * len(targets)
-    N, e = np.eye(size), np.zeros(0)
+    N, e, e_rows = np.eye(size), np.zeros(0), [np.zeros(0)]
     p = np.asarray(p, dtype=float)
     for _ in range(_STEPS):
         J_rows, e_rows = [], []
@@ -181,4 +184,4 @@ def _solved(touches: Sequence[WireTouch], p: Array, axis: Array, wire_m: float, 
             break
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-30))
     C = scale[:, None] * np.linalg.inv(scale[:, None] * N * scale + 1e-12 * np.eye(size)) * scale
-    return _Solution(p, C[:3, :3], float(e @ e), len(e) - size)
+    return _Solution(p, C[:3, :3], np.array([float(r @ r) for r in e_rows]), len(e) - size)
