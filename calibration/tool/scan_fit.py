@@ -8,7 +8,7 @@ approaches to variance component estimation, JASA 72, 1977).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -72,7 +72,9 @@ def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: st
         ToolNotFound: too few scans show it.
     """
     surface, scale, P = start, 0.0, start.size
-    seen = [s for s in scans if int(np.count_nonzero(start.near(s.p_F))) >= FEWEST_CELLS]
+    about = [s.p_F[np.linalg.norm(s.p_F - start.middle, axis=1) < start.around_m] for s in scans]
+    cropped = [replace(s, p_F=p) for s, p in zip(scans, about, strict=True)]
+    seen = [s for s in cropped if int(np.count_nonzero(start.near(s.p_F))) >= FEWEST_CELLS]
     if len(seen) < FEWEST_SCANS:
         raise ToolNotFound(
             f"{len(seen)} scans show the {what} where the tool file has it, and {FEWEST_SCANS} are needed. Scan it from"
@@ -83,7 +85,8 @@ def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: st
     n = len(seen)
     total = P + 6 + 6 * n
     x_nuisance: Array = np.zeros(total - P)
-    C, rows = np.eye(total), None
+    C: Array = np.eye(total)
+    rows: _Rows | None = None
     for step in range(STEPS):
         rows, scale = _rows(surface, seen, x_nuisance, scale)
         if len(rows.e) < P + FEWEST_CELLS:

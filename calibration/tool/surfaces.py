@@ -15,6 +15,7 @@ Flags = NDArray[np.bool_]
 
 KNOT_M = 0.005  # a choice: a nozzle's profile bends over some millimetres
 CELL_M = 0.003  # a choice: some pixels of a scanner, beyond the width over which its noise is smooth
+SPARE_M = 0.01  # a choice: no fit moves a surface farther
 _STIFF_M = 0.002  # a choice: how far a knot that no point holds may leave the line of its neighbours
 _ABOVE = 0.3  # of the radius: the ball ends in a rod above its middle
 
@@ -29,6 +30,10 @@ class Surface(Protocol):
     @property
     def middle(self) -> Array:
         """Its place (3,) m in F, about which a scan's turn is counted."""
+
+    @property
+    def around_m(self) -> float:
+        """Distance from its place beyond which no point can lie on it."""
 
     def near(self, p: Array) -> Flags:
         """Which points (N, 3) may lie on it."""
@@ -96,8 +101,13 @@ class Nozzle:
     def _round(self, p: Array) -> tuple[Array, Array, Array]:
         """Place along the axis (N,) m, distance from it (N,) m, direction away from it (N, 2)."""
         q = (p - self.centre) @ self.axes.T
-        r = np.maximum(np.hypot(q[:, 0], q[:, 1]), 1e-9)
+        r = np.maximum(np.sqrt(q[:, 0] ** 2 + q[:, 1] ** 2), 1e-9)
         return q[:, 2], r, q[:, :2] / r[:, None]
+
+    @property
+    def around_m(self) -> float:
+        """Distance from its place beyond which no point can lie on it."""
+        return float(np.hypot(self.knots[-1], self.reach_m)) + SPARE_M
 
     def near(self, p: Array) -> Flags:
         """Which points (N, 3) lie beside the part of the axis that is fitted."""
@@ -189,6 +199,11 @@ class Ball:
     def middle(self) -> Array:
         """Its place (3,) m."""
         return self.centre
+
+    @property
+    def around_m(self) -> float:
+        """Distance from its place beyond which no point can lie on it."""
+        return self.reach_m + SPARE_M
 
     def near(self, p: Array) -> Flags:
         """Which points (N, 3) lie about the ball's free half."""

@@ -13,6 +13,7 @@ import argparse
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -21,6 +22,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from weldcal.calibration.data.results import CalibrationResult, save_result
 from weldcal.calibration.tool.measure import ToolMeasurement, measure_tool
 from weldcal.calibration.tool.scan_fit import ToolScan
 from weldcal.calibration.tool.wire import WireTouch
@@ -249,6 +251,28 @@ def touch(id: str, feature: str, truth: Truth, rng: np.random.Generator, k: int,
     return WireTouch(id, turned(RigidTransform(RotationMatrix(R_BF), p_BF), REPEAT_RAD, REPEAT_M, rng), feature)
 
 
+def written(c: Cell, folder: Path) -> None:
+    """Write scans/ as a dataset, result/ as `weldcal calibrate` does, and touches.csv."""
+    scans = folder / "scans"
+    (scans / "clouds").mkdir(parents=True)
+    names = "id,x,y,z,qw,qx,qy,qz"
+
+    def row(id: str, X: RigidTransform) -> str:
+        return ",".join([id, *(repr(float(v)) for v in (*X.translation(), *X.rotation().ToQuaternion().wxyz()))])
+
+    poses = [row(s.id, X) for s, X in zip(c.scans, c.poses, strict=True)]
+    (scans / "poses.csv").write_text("\n".join([names, *poses, ""]))
+    units = "schema: 1\nrobot: ur10e\nflange: tool-ring-63\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+    (scans / "dataset.yaml").write_text(units)
+    for scan, cloud in zip(c.scans, c.clouds, strict=True):
+        np.save(scans / "clouds" / f"{scan.id}.npy", cloud.astype(np.float32))
+    result = CalibrationResult(X_BC=c.X_BC, covariance=c.covariance, held_out_mm={}, tilt_deg={}, poses=())
+    (folder / "result").mkdir()
+    save_result(result, folder / "result")
+    touches = [f"{row(t.id, t.X_BF)},{t.feature}" for t in c.touches]
+    (folder / "touches.csv").write_text("\n".join([f"{names},feature", *touches, ""]))
+
+
 @dataclass(frozen=True)
 class Judged:
     axis_deg: float
@@ -348,10 +372,13 @@ def main() -> None:
     parser.add_argument("--tools", type=int, default=200)
     parser.add_argument("--first", type=int, default=1000, help="first seed")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--trials", nargs="*", default=["random", "half", "straight"])
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.tools)
     with ProcessPoolExecutor(given.workers) as pool:
-        for name, work in (("bent 0 to 5 mm, 0 to 3 deg", _random), ("bent 0.5 mm", _half), ("straight", _straight)):
+        trials = {"random": ("bent 0 to 5 mm, 0 to 3 deg", _random), "half": ("bent 0.5 mm", _half)}
+        trials["straight"] = ("straight", _straight)
+        for name, work in (trials[key] for key in given.trials):
             _said(name, list(pool.map(work, seeds, chunksize=5)))
 
 

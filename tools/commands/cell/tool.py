@@ -193,6 +193,8 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
     tell("looking for the ring", 0.2)
     standard = loaded.tool.ring
     ring = None if standard is None else find_ring(data, calibration, loaded.tool.X_FR, standard)
+    if standard is not None and ring is None:
+        notes = (*notes, "Fewer than three scans show the ring: it was not measured.")
     tell("measuring the nozzle", 0.5)
     found = measure_tool(
         loaded,
