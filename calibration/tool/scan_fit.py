@@ -27,6 +27,7 @@ FEWEST_POINTS = 3  # of a cell
 _STEEPEST_DEG = 65.0  # a choice: of the ray against the normal; points nearer to the outline are blurred
 _SHIFT_M, _TURN_RAD = 2e-5, 5e-5  # least deviations of a scan: an arm's repeatability, 0.03 mm, and 0.003 degrees
 _NOISE_M = 5e-6  # least deviation of a cell's mean
+_SETTLING, _SETTLED = 8, 1e-6  # steps in which the scale narrows, and a step in m or rad that changes nothing
 _EXACT_M, _EXACT_RAD = 1e-6, 1e-6  # of a calibration that states no error
 
 S = TypeVar("S", bound=Surface)
@@ -65,6 +66,15 @@ class _Rows:
     on: Array  # points on the surface
 
 
+@dataclass(frozen=True)
+class _Spread:
+    """Deviations of a scan's turn (rad) and shift (m) and of a cell's mean (m); first a guess."""
+
+    turn: float = 1e-3
+    shift: float = 1e-4
+    noise: float = 1e-4
+
+
 def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: str) -> SurfaceFit[S]:
     """Fit a surface to scans; ``covariance`` (6, 6) of X_BC as in a result, ``what`` names the surface.
 
@@ -81,47 +91,46 @@ def fit_surface(start: S, scans: Sequence[ToolScan], covariance: Array, what: st
             " more sides, or correct the tool file."
         )
     prior = np.linalg.inv(covariance + np.diag(np.repeat([_EXACT_RAD, _EXACT_M], 3) ** 2))
-    shift, turn, noise = 1e-4, 1e-3, 1e-4  # starts, m, rad, m
+    spread = _Spread()
     n = len(seen)
-    total = P + 6 + 6 * n
-    x_nuisance: Array = np.zeros(total - P)
-    C: Array = np.eye(total)
-    rows: _Rows | None = None
+    nuisance: Array = np.zeros(6 + 6 * n)
+    C: Array = np.eye(P + len(nuisance))
+    on = np.zeros((0, 3))
     for step in range(STEPS):
-        rows, scale = _rows(surface, seen, x_nuisance, scale)
+        rows, scale = _rows(surface, seen, nuisance, scale)
         if len(rows.e) < P + FEWEST_CELLS:
             raise ToolNotFound(
                 f"Too few points lie on the {what}: scan it nearer and from more sides, or correct the tool file."
             )
-        N = rows.J.T @ rows.J / noise**2
+        N = rows.J.T @ rows.J / spread.noise**2
         held = surface.prior()
         N[:P, :P] += held.T @ held
-        apart = np.concatenate([[turn**-2] * 3, [shift**-2] * 3])
-        weights = np.zeros((total - P, total - P))
+        weights = np.zeros((len(nuisance), len(nuisance)))
         weights[:6, :6] = prior
-        weights[6:, 6:] = np.diag(np.tile(apart, n))
+        weights[6:, 6:] = np.diag(np.tile(np.repeat([spread.turn, spread.shift], 3) ** -2.0, n))
         N[P:, P:] += weights
-        g = rows.J.T @ rows.e / noise**2
-        g[P:] += weights @ x_nuisance
-        C = np.linalg.inv(N + 1e-9 * np.diag(np.diag(N)))
+        g = rows.J.T @ rows.e / spread.noise**2
+        g[P:] += weights @ nuisance
+        C = np.asarray(np.linalg.inv(N + 1e-9 * np.diag(np.diag(N))), dtype=np.float64)
         x = -C @ g
-        surface = surface.moved(x[:P])
-        x_nuisance = x_nuisance + x[P:]
-        # the variance components, from what the last step left
-        own = x_nuisance[6:].reshape(n, 2, 3)
-        spread = np.diag(C)[P + 6 :].reshape(n, 2, 3)
-        turn = max(float(np.sqrt((own[:, 0] ** 2 + spread[:, 0]).mean())), _TURN_RAD)
-        shift = max(float(np.sqrt((own[:, 1] ** 2 + spread[:, 1]).mean())), _SHIFT_M)
-        left = rows.e + rows.J @ x
-        used = float(np.einsum("ij,ij->", rows.J @ C, rows.J)) / noise**2  # unknowns that the cells pay for
-        noise = max(float(np.sqrt(left @ left / max(len(left) - used, 1.0))), _NOISE_M)
-        if step > 8 and float(np.abs(x[:4]).max()) < 1e-6:
+        surface, nuisance, on = surface.moved(x[:P]), nuisance + x[P:], rows.on
+        spread = _spread(rows, x, C, nuisance[6:], spread.noise)
+        if step > _SETTLING and float(np.abs(x[:P]).max()) < _SETTLED:
             break
-    assert rows is not None
     widened = 3.0 * f_quantile(0.95, 3, max(2 * n - 4, 2)) / chi2_quantile(0.95, 3)
     return SurfaceFit(
-        surface=surface, covariance=widened * C[:P, :P], points=rows.on, noise_m=noise, scans=n, cells=len(rows.e)
+        surface=surface, covariance=widened * C[:P, :P], points=on, noise_m=spread.noise, scans=n, cells=len(rows.e)
     )
+
+
+def _spread(rows: _Rows, x: Array, C: Array, own: Array, noise: float) -> _Spread:
+    """Estimate the variance components anew, from what a step ``x`` with covariance ``C`` left."""
+    moved, variance = own.reshape(-1, 2, 3), np.diag(C)[-len(own) :].reshape(-1, 2, 3)
+    turn, shift = np.sqrt((moved**2 + variance).mean(axis=(0, 2)))
+    left = rows.e + rows.J @ x
+    used = float(np.einsum("ij,ij->", rows.J @ C, rows.J)) / noise**2  # unknowns that the cells pay for
+    now = float(np.sqrt(left @ left / max(len(left) - used, 1.0)))
+    return _Spread(max(float(turn), _TURN_RAD), max(float(shift), _SHIFT_M), max(now, _NOISE_M))
 
 
 def _rows(surface: Surface, scans: Sequence[ToolScan], nuisance: Array, scale: float) -> tuple[_Rows, float]:

@@ -71,7 +71,15 @@ def tool_check(
         return Outcome(check.summary(), values={}, rows=check.rows())
     if calibration is None:
         raise InputError("--measure needs --calibration RESULT: the folder that 'weldcal calibrate' wrote.")
-    order = MeasureOrder(measure, calibration, file, touches, scenario, nozzle_mm, wire_mm)
+    order = MeasureOrder(
+        dataset=measure,
+        calibration=calibration,
+        tool=file,
+        touches=touches,
+        scenario=scenario,
+        nozzle_mm=nozzle_mm,
+        wire_mm=wire_mm,
+    )
     report = run_measurement(order, call.folder("tool", file.stem), call.progress)
     return Outcome(
         report.summary(),
@@ -96,12 +104,20 @@ def tool_measure(
 ) -> Outcome:
     """Measure nozzle axis, tip and ring in scans of a calibrated cell, and the wire's end by touches; write a new tool
     file."""
-    order = MeasureOrder(dataset, calibration, tool_file(tool), touches, scenario, nozzle_mm, wire_mm)
+    order = MeasureOrder(
+        dataset=dataset,
+        calibration=calibration,
+        tool=tool_file(tool),
+        touches=touches,
+        scenario=scenario,
+        nozzle_mm=nozzle_mm,
+        wire_mm=wire_mm,
+    )
     report = run_measurement(order, call.folder("tool-measure", dataset.resolve().name), call.progress)
     return Outcome(report.summary(), values={}, rows=report.rows())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MeasureOrder:
     """What the command was given."""
 
