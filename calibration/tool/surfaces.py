@@ -80,7 +80,7 @@ class Nozzle:
         s, r, _ = start._round(points)
         found = [r[(np.abs(s - k) < KNOT_M) & (r < reach_m)] for k in knots]
         known = np.array([float(np.median(f)) if len(f) else np.nan for f in found])
-        usual = float(np.nanmedian(known))
+        usual = float(np.nanmedian(known)) if np.isfinite(known).any() else reach_m
         return replace(start, radii=np.where(np.isfinite(known), known, usual))
 
     @property
