@@ -97,8 +97,8 @@ class Move:
 class ToolMeasurement:
     """What scans and touches show of a tool.
 
-    ``axis`` (3,), and ``p_FN`` (3,) m the point of the nozzle's axis beside the wire point of the file, with the
-    covariance (4, 4) of its shifts (m) and turns (rad) along the first two rows of ``nozzle.surface.axes``.
+    ``axis`` (3,), and ``p_FN`` (3,) m the point of the nozzle's axis beside the wire point of the file.
+    ``axis_covariance`` (4, 4) of its shifts (m) and turns (rad) along the first two rows of ``nozzle.surface.axes``.
     ``mouth_m`` is the nozzle's end behind the wire point, its stick-out, with its sigma; NaN where it is not seen.
     """
 
@@ -233,7 +233,7 @@ def measure_tool(
 
 
 def _stick_out(nozzle: Nozzle, points: Array, p_FW: Array) -> tuple[float, float]:
-    """Return how far the wire's end stands beyond the nozzle's mouth, m, and the sigma of the mouth."""
+    """Return the length of wire beyond the nozzle's mouth, m, and the sigma of the mouth."""
     mouth, sigma = nozzle.mouth(points, _PROFILE_M)
     return float((p_FW - nozzle.centre) @ nozzle.axis) - mouth, sigma
 

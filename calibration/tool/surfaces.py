@@ -69,8 +69,8 @@ class Nozzle:
     def about(cls, p_FW: Array, axis: Array, start_m: float, length_m: float, points: Array, reach_m: float) -> Nozzle:
         """Return the start of a fit.
 
-        The part of the file's axis between ``start_m`` and ``start_m + length_m`` behind the wire point p_FW (3,) m,
-        with the median radius of the points (N, 3) beside it.
+        The part of the file's axis begins ``start_m`` behind the wire point p_FW (3,) m and is ``length_m`` long. Its
+        radii are the medians of the points (N, 3) beside it.
         """
         axes = frames_along(axis[None])[0].T
         centre = p_FW - (start_m + 0.5 * length_m) * axes[2]

@@ -87,8 +87,8 @@ def find_wire(
 ) -> WirePoint:
     """Find the wire's end from touches; start p_FW (3,) m, direction (3,) of the wire, its diameter m.
 
-    A point gives X_BF p_FW = p_B of its own, a plate n (X_BF p_FW) = d with the edge of the wire's flat end below its
-    middle where the wire leans. ``normal_B`` (3,) is a start of each plate's normal: upwards where it is not given. One
+    A point gives X_BF p_FW = p_B, a plate n (X_BF p_FW) = d. Where the wire leans, the edge of its flat end touches the
+    plate. ``normal_B`` (3,) is a start of each plate's normal: upwards where it is not given. One
     touch that contradicts the others is left out.
 
     Raises:

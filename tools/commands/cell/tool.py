@@ -57,8 +57,10 @@ def tool_check(
     nozzle_mm: NozzleOption = NOZZLE_MM,
     wire_mm: WireOption = WIRE_MM,
 ) -> Outcome:
-    """Read a tool file, say what was understood of it, and draw it: tool.png and tool.html. With --measure, measure the
-    tool and say what has moved, and whether the seam tolerance holds."""
+    """Read a tool file, say what was understood of it, and draw it: tool.png and tool.html.
+
+    With --measure, say what of the tool has moved, and whether the seam tolerance holds.
+    """
     if measure is None:
         if calibration is not None or touches is not None or scenario is not None:
             raise InputError("--calibration, --touches and --scenario belong to --measure DATASET: name the scans.")
@@ -102,8 +104,10 @@ def tool_measure(
     nozzle_mm: NozzleOption = NOZZLE_MM,
     wire_mm: WireOption = WIRE_MM,
 ) -> Outcome:
-    """Measure nozzle axis, tip and ring in scans of a calibrated cell, and the wire's end by touches; write a new tool
-    file."""
+    """Measure nozzle, tip and ring by scans of a calibrated cell and the wire's end by touches.
+
+    The result is a new tool file with the measured torch.
+    """
     order = MeasureOrder(
         dataset=dataset,
         calibration=calibration,
