@@ -17,7 +17,7 @@ from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile, radius_95
 from weldcal.calibration.geometry.se3 import frames_along, skew
 from weldcal.calibration.tool.scan_fit import FEWEST_SCANS, SurfaceFit, ToolScan, fit_surface
-from weldcal.calibration.tool.surfaces import Ball, Nozzle
+from weldcal.calibration.tool.surfaces import TipBall, Nozzle
 from weldcal.calibration.tool.wire import WirePoint, WireTouch, find_wire
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -106,7 +106,7 @@ class ToolMeasurement:
     nozzle: SurfaceFit[Nozzle]
     p_FN: Array
     axis_covariance: Array
-    ball: SurfaceFit[Ball] | None
+    ball: SurfaceFit[TipBall] | None
     ring: RingPlace | None
     wire: WirePoint | None
     stick_out_m: float
@@ -238,10 +238,12 @@ def _stick_out(nozzle: Nozzle, points: Array, p_FW: Array) -> tuple[float, float
     return float((p_FW - nozzle.centre) @ nozzle.axis) - mouth, sigma
 
 
-def _ball(tool: LoadedTool, scans: Sequence[ToolScan], covariance: Array, notes: list[str]) -> SurfaceFit[Ball] | None:
+def _ball(
+    tool: LoadedTool, scans: Sequence[ToolScan], covariance: Array, notes: list[str]
+) -> SurfaceFit[TipBall] | None:
     t = tool.tool
     axis = -t.X_FT.rotation().matrix()[:, 2]
-    start = Ball(np.array(t.X_FT.translation()), t.tip_radius_m, axis, t.tip_radius_m + _BESIDE_M)
+    start = TipBall(np.array(t.X_FT.translation()), t.tip_radius_m, axis, t.tip_radius_m + _BESIDE_M)
     try:
         return fit_surface(start, scans, covariance, "tip's ball")
     except ToolNotFound as missing:

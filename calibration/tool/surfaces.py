@@ -185,7 +185,7 @@ class Nozzle:
 
 
 @dataclass(frozen=True, eq=False)
-class Ball:
+class TipBall:
     """A ball of known radius m at a centre (3,) m, at the end of a rod that points along ``axis`` (3,)."""
 
     centre: Array
@@ -227,6 +227,6 @@ class Ball:
         """Return no rows: the points hold all of it."""
         return np.zeros((0, 3))
 
-    def moved(self, x: Array) -> Ball:
+    def moved(self, x: Array) -> TipBall:
         """Return the ball after a shift (3,) m."""
         return replace(self, centre=self.centre + x)

@@ -176,7 +176,7 @@ def turned(X: RigidTransform, rad: float, m: float, rng: np.random.Generator) ->
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cell:
     """What the measurement gets."""
 
@@ -224,7 +224,15 @@ def cell(seed: int, wrong: Wrong, scans: int = SCANS, touches: int = TOUCHES, pl
         poses.append(X_BF)
     touched = [touch(f"t{k}", "point", truth, rng, k, touches) for k in range(touches)]
     touched += [touch(f"u{k}", "plate", truth, rng, k, plates) for k in range(plates)]
-    return Cell(tuple(out), tuple(clouds), tuple(poses), stated, np.diag(sigma**2), tuple(touched), truth)
+    return Cell(
+        scans=tuple(out),
+        clouds=tuple(clouds),
+        poses=tuple(poses),
+        X_BC=stated,
+        covariance=np.diag(sigma**2),
+        touches=tuple(touched),
+        truth=truth,
+    )
 
 
 def touch(id: str, feature: str, truth: Truth, rng: np.random.Generator, k: int, n: int) -> WireTouch:
@@ -273,7 +281,7 @@ def written(c: Cell, folder: Path) -> None:
     (folder / "touches.csv").write_text("\n".join([f"{names},feature", *touches, ""]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Judged:
     axis_deg: float
     axis_inside: bool
@@ -305,17 +313,17 @@ def judge(found: ToolMeasurement, truth: Truth) -> Judged:
     assert wire is not None
     assert nozzle is not None
     return Judged(
-        float(np.degrees(np.arccos(np.clip(found.axis @ truth.axis, -1.0, 1.0)))),
-        axis2 < chi2.ppf(0.95, 2),
-        axis2,
-        1e3 * float(np.linalg.norm(off)),
-        wire2 < chi2.ppf(0.95, 3),
-        wire2,
-        1e3 * float(np.linalg.norm(ball)),
-        ball2 < chi2.ppf(0.95, 3),
-        1e3 * (found.stick_out_m - truth.stick_out),
-        wire.moved,
-        nozzle.moved,
+        axis_deg=float(np.degrees(np.arccos(np.clip(found.axis @ truth.axis, -1.0, 1.0)))),
+        axis_inside=axis2 < chi2.ppf(0.95, 2),
+        axis_chi2=axis2,
+        wire_mm=1e3 * float(np.linalg.norm(off)),
+        wire_inside=wire2 < chi2.ppf(0.95, 3),
+        wire_chi2=wire2,
+        ball_mm=1e3 * float(np.linalg.norm(ball)),
+        ball_inside=ball2 < chi2.ppf(0.95, 3),
+        stick_out_mm=1e3 * (found.stick_out_m - truth.stick_out),
+        noticed=wire.moved,
+        nozzle_noticed=nozzle.moved,
     )
 
 
