@@ -17,7 +17,7 @@ from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile, radius_95
 from weldcal.calibration.geometry.se3 import frames_along, skew
 from weldcal.calibration.tool.scan_fit import FEWEST_SCANS, SurfaceFit, ToolScan, fit_surface
-from weldcal.calibration.tool.surfaces import TipBall, Nozzle
+from weldcal.calibration.tool.surfaces import Nozzle, TipBall
 from weldcal.calibration.tool.wire import WirePoint, WireTouch, find_wire
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
