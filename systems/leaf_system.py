@@ -61,7 +61,7 @@ def _metaclass() -> Any:
     )
 
 
-class LeafSystem(DrakeLeafSystem, metaclass=_metaclass()):
+class LeafSystem(DrakeLeafSystem, metaclass=_metaclass()):  # type: ignore[metaclass]
     """A Drake LeafSystem that is freed with its Diagram.
 
     Two things keep others in memory for ever, with plants and renderers:
