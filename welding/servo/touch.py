@@ -47,9 +47,9 @@ def check_length(line: SeamCurve, config: ServoConfig) -> None:
         SeamError: with the least length.
     """
     least = config.touch.arc_m + config.gap.end_window_m
-    if line.length < least:
+    if line.drawn_m < least:
         raise SeamError(
-            f"The seam is only {1e3 * line.length:.0f} mm long: too short for the touch-on, which needs"
+            f"The seam is only {1e3 * line.drawn_m:.0f} mm long: too short for the touch-on, which needs"
             f" {1e3 * least:.0f} mm."
         )
 
