@@ -66,7 +66,7 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     for name in ("record", "dry_run"):
         if live.get(name):
             raise InputError(f"A restart cannot be done with --{name.replace('_', '-')}: omit it.")
-    options: dict[str, Any] = {"replace": restarting(progress.restart(1e-3 * overlap_mm)), "seed": progress.seed}
+    options: dict[str, Any] = {"replace": restarting(progress.restart(1e-3 * overlap_mm))}
     if live.get("robot") is None:
         options["robot"] = progress.robot
     return BrokenWeld(progress, load_scenario(str(folder / RESTART / SCENARIO)), options)

@@ -63,6 +63,7 @@ def weld(
         if name is not None or scenario != PRESET:
             raise typer.BadParameter("--resume takes the scenario from its folder: give no other")
         broken = broken_weld(resume, overlap_mm, call.live)
+        call.seed = broken.progress.seed
         options = run_options(call, "weld", broken.progress.scenario, **broken.options)
         found = run_scenario(broken.scenario, options, call.progress, broken.progress)
         return Outcome(found.summary(), first=found.first)
@@ -129,13 +130,15 @@ def run_scenario(
         raise
     keeper.close(finished.run)
     progress("measure and write", finished.share(0.985))
-    result = measure(finished.run, options, finished.robot)
+    result = measure(finished.run, options, finished.robot, keeper.progress)
     write_result(result, finished)
     return result
 
 
-def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
-    """Compare the run with the ground truth of its simulation."""
+def measure(
+    run: Run[WeldJob], options: RunOptions, robot: str = "simulated", progress: WeldProgress | None = None
+) -> DemoResult:
+    """Compare the run with the ground truth of its simulation; `progress`: how far the weld has come."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
     error = (
         None
@@ -144,8 +147,17 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
     )
     weld = weld_outcome(cell, run.root)
     log = None if weld is None else weld_record(run, weld, options.seed, options.scenario, robot)
-    record = None if log is None else part_record(run, log)
-    return DemoResult(options=options, run=run, status=status, calibration=error, weld=weld, robot=robot, record=record)
+    record = None if log is None else part_record(run, log, progress)
+    return DemoResult(
+        options=options,
+        run=run,
+        status=status,
+        calibration=error,
+        weld=weld,
+        robot=robot,
+        record=record,
+        broken=progress is not None and bool(progress.stretches) and not progress.done,
+    )
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:

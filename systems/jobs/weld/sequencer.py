@@ -15,6 +15,10 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
 
+NOT_HOME = (
+    "The arm may still be at the broken seam, and its way home past the part is not checked: move it to home_deg with the"
+    " pendant, then resume the weld again."
+)
 SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
 """Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
@@ -40,7 +44,7 @@ class JobPlan:
     maximum_time_s: float = 240.0
     seams: int = 1
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
-    first: tuple[int, int] = (0, 0)  # seam and piece that the job begins with: later ones after a restart
+    first: tuple[int, int] | None = None  # seam and piece with which a broken weld goes on; None: a new weld
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,7 +161,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         late = "{} arrived within {:.0f} s of its trigger. Look at the scanner."
         no_scan = (plan.scan_timeout_s, late.format("No scan", plan.scan_timeout_s))
         super().__init__(
-            JobState(seam=plan.first[0], piece=plan.first[1]),
+            JobState() if plan.first is None else JobState(seam=plan.first[0], piece=plan.first[1]),
             move_timeout_s=plan.move_timeout_s,
             maximum_time_s=plan.maximum_time_s,
             timeouts={
@@ -222,6 +226,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     def _start(self, s: JobState, now: JobInputs) -> JobState:
         if not stands_at(now.q, self._plan.q_home):
+            if self._plan.first is not None:
+                return self.held(s, now, NOT_HOME)
             return self._homeward(s, now, "move_home")
         return self._begin(s, now)
 
