@@ -78,7 +78,9 @@ class Torch:
         return np.array(struct.unpack("3d", self._memory[:24]))
 
 
-def weld_until(scenario: Scenario, seed: int, at_m: float, kind: str, folder: Path, torch: Torch, emulator: Emulator | None) -> None:
+def weld_until(
+    scenario: Scenario, seed: int, at_m: float, kind: str, folder: Path, torch: Torch, emulator: Emulator | None
+) -> None:
     """Weld and break off where the torch has come to `at_m`; a kill does not return."""
     operator = Operator()
     cell = build_cell(scenario, seed, operator=operator)
@@ -206,7 +208,8 @@ def apart(work: Callable[[], Any]) -> tuple[int, Any]:
 def one(kind: str, at_m: float, seed: int, place: Path) -> Join | None:
     """Break a weld off and go on with it; None where the second run failed."""
     if kind == "pause":
-        return apart(lambda: pause(short_weld(), seed, at_m))[1]
+        paused: Join | None = apart(lambda: pause(short_weld(), seed, at_m))[1]
+        return paused
     torch = Torch()
     with ExitStack() as stack:
         emulator: Emulator | None = None
@@ -227,7 +230,8 @@ def one(kind: str, at_m: float, seed: int, place: Path) -> Join | None:
         if kind in WIRED:  # the operator frees the arm, and moves it home by the pendant
             stack.close()
             emulator = stack.enter_context(emulator_process(q=q, lockstep=LOCKSTEP_S))
-        return apart(lambda: go_on(scenario(), seed, progress, place / "2", torch))[1]
+        found: Join | None = apart(lambda: go_on(scenario(), seed, progress, place / "2", torch))[1]
+        return found
 
 
 def main(times: int, seed: int, kinds: tuple[str, ...]) -> int:

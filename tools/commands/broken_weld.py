@@ -21,12 +21,10 @@ from weldcal.welding.record.progress import Progress, ProgressError, load_progre
 from weldcal.welding.seam.restart import Restart
 
 ResumeOption = Annotated[
-    Path | None,
-    option("--resume", "FOLDER", "Go on with the broken weld of this result folder, from its crater."),
+    Path | None, option("--resume", "FOLDER", "Go on with the broken weld of this result folder, from its crater.")
 ]
 OverlapOption = Annotated[
-    float,
-    option("--overlap-mm", "MM", "With --resume: the arc starts so far before the crater.", min=5.0, max=10.0),
+    float, option("--overlap-mm", "MM", "With --resume: the arc starts so far before the crater.", min=5.0, max=10.0)
 ]
 
 
@@ -49,9 +47,7 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     if progress.done:
         raise ProgressError(f"The weld in '{folder}' is complete: nothing is left to weld.")
     if progress.continued_in:
-        raise ProgressError(
-            f"The weld in '{folder}' has gone on in '{progress.continued_in}': resume that one."
-        )
+        raise ProgressError(f"The weld in '{folder}' has gone on in '{progress.continued_in}': resume that one.")
     files = {path.name: path.read_bytes() for path in (folder / RESTART).glob("*") if path.is_file()}
     if sha256_of(files) != progress.scenario_sha256:
         raise ProgressError(
@@ -92,10 +88,5 @@ def keeper_of(scenario: Scenario, options: RunOptions, earlier: Progress | None 
     begun = earlier or Progress(
         scenario=options.scenario, seed=options.seed, robot=options.robot, scenario_sha256="", folders=()
     )
-    begun = dc.replace(
-        begun,
-        scenario_sha256=sha256_of(files),
-        folders=(*begun.folders, folder),
-        robot=options.robot,
-    )
+    begun = dc.replace(begun, scenario_sha256=sha256_of(files), folders=(*begun.folders, folder), robot=options.robot)
     return ProgressKeeper(options.out, files, begun)

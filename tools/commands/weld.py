@@ -25,12 +25,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
-from weldcal.tools.commands.broken_weld import (
-    OverlapOption,
-    ResumeOption,
-    broken_weld,
-    keeper_of,
-)
+from weldcal.tools.commands.broken_weld import OverlapOption, ResumeOption, broken_weld, keeper_of
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
 from weldcal.tools.report.files import write_json
@@ -112,10 +107,7 @@ def known_camera(name: str) -> Scenario:
 
 
 def run_scenario(
-    scenario: Scenario,
-    options: RunOptions,
-    progress: Progress = no_progress,
-    earlier: WeldProgress | None = None,
+    scenario: Scenario, options: RunOptions, progress: Progress = no_progress, earlier: WeldProgress | None = None
 ) -> DemoResult:
     """Build and run the cell, evaluate the run and write its results; `earlier`: of the weld that it goes on with.
 

@@ -68,10 +68,7 @@ class PartRecord:
     @property
     def outside(self) -> list[str]:
         """A sentence for each limit that a seam exceeds, and for each stretch that nothing is known of."""
-        return [
-            *self.lost,
-            *self._outside(),
-        ]
+        return [*self.lost, *self._outside()]
 
     def _outside(self) -> list[str]:
         return [

@@ -125,11 +125,15 @@ def load_progress(folder: Path) -> Progress:
     if document.get("version") != VERSION:
         raise ProgressError(f"{path} has version {document.get('version')}; this weldcal reads version {VERSION}.")
     try:
-        arrays = {name: _array(document[name], shape) for name, shape in _ARRAYS.items()}
+        arrays: dict[str, Any] = {name: _array(document[name], shape) for name, shape in _ARRAYS.items()}
         sigma = document["sigma_mm"]
         return Progress(
-            **{k: str(document[k]) for k in ("scenario", "scenario_sha256", "continued_in")},
-            **{k: int(document[k]) for k in ("seed", "seam", "piece")},
+            scenario=str(document["scenario"]),
+            scenario_sha256=str(document["scenario_sha256"]),
+            continued_in=str(document["continued_in"]),
+            seed=int(document["seed"]),
+            seam=int(document["seam"]),
+            piece=int(document["piece"]),
             robot=None if document["robot"] is None else str(document["robot"]),
             folders=tuple(map(str, document["folders"])),
             stretches=tuple(Stretch(**row) for row in document["stretches"]),

@@ -24,9 +24,7 @@ def start_state(felt: Array | None) -> WeldingState:
     return WeldingState(touch=TouchOnState(felt=tuple(PendingPoint(row[:3], float(row[3])) for row in felt)))
 
 
-def with_felt_before(
-    state: WeldingState, sample: ServoSample, config: ServoConfig
-) -> tuple[WeldingState, str | None]:
+def with_felt_before(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, str | None]:
     """The state of a seated tip with the path of the earlier run behind it, and the plan registered to that path.
 
     Returns:

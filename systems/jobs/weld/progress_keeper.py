@@ -3,7 +3,6 @@
 import hashlib
 import math
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime

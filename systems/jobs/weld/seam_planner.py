@@ -353,15 +353,17 @@ def gone_on(
         return planning, seam, arc, begins
     planning.restart.check_unmoved(whole, X_BP, sigma_m)
     config = planning.config
-    cut = planning.restart.cut(
-        seam, planning.tool.chord_m, RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
-    )
+    cut = planning.restart.cut(seam, planning.tool.chord_m, RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m)
     begun = {**begins, "question": cut.question(planning.number)}
     if cut.down_m is None:
         return planning, seam, arc, begun
     from_m = begins["begins_m"]
     words = cut._replace(start_m=from_m + cut.start_m, crater_m=from_m + cut.crater_m)
-    begun = {"begins_m": words.start_m, "felt_before": planning.restart.felt, "question": words.question(planning.number)}
+    begun = {
+        "begins_m": words.start_m,
+        "felt_before": planning.restart.felt,
+        "question": words.question(planning.number),
+    }
     return dc.replace(planning, config=leaning(config, 0.0, cut.down_m)), cut.line, cut.down_m, begun
 
 
