@@ -65,4 +65,6 @@ def with_felt_before(state: WeldingState, sample: ServoSample, config: ServoConf
     fit = add_point(fit, points[spaced[-1]], float(s[spaced[-1]]), config.plan_fit)
     arc = fit.curve.project(points, at - 0.5 * window, window) + lag
     keep = np.concatenate([[True], np.diff(arc) > 0.0])
-    return changed(state, plan_fit=fit, refined=RefinedSeam(points[keep], arc[keep])), None
+    # Registering the plan may move it along itself; the crater stays where it is.
+    start = np.asarray(fit.plan.position(0.0))
+    return changed(state, plan_fit=fit, refined=RefinedSeam(points[keep], arc[keep]), start_point=start), None
