@@ -35,11 +35,7 @@ from weldcal.welding.servo.state import ServoSample, WeldingCommand, WeldingStat
 from weldcal.welding.servo.step import welding_step
 
 UP = np.array((0.0, 0.0, 1.0))
-SEAMS = {
-    "straight": arcs((0.12, 0.0), spacing=2e-3),
-    "s": s_curve(),
-    "corner": corner(0.020, 60.0, -1.0, 0.06),
-}
+SEAMS = {"straight": arcs((0.12, 0.0), spacing=2e-3), "s": s_curve(), "corner": corner(0.020, 60.0, -1.0, 0.06)}
 KINDS = ("pause", "stop", "kill")
 """Pause: an operator holds the weld and lets it go on. Stop: what stands in the file is the newest. Kill: it is up to
 EVERY_M older, as after a loss of power."""
@@ -52,8 +48,11 @@ class Broken:
     """The servo until the torch has come to a place; the progress as its keeper writes it."""
 
     def __init__(self, at_m: float, kind: str) -> None:
-        self.at_m, self.kind, self.written, self.newest = at_m, kind, -math.inf, Progress(
-            scenario="", seed=0, robot=None, scenario_sha256="", folders=("",)
+        self.at_m, self.kind, self.written, self.newest = (
+            at_m,
+            kind,
+            -math.inf,
+            Progress(scenario="", seed=0, robot=None, scenario_sha256="", folders=("",)),
         )
 
     def __call__(
@@ -130,9 +129,7 @@ def broken_off(name: str, at_m: float, kind: str, seed: int, budget: Budget, mov
     with tempfile.TemporaryDirectory() as folder:
         first.newest.write(Path(folder))
         restart = load_progress(Path(folder)).restart(OVERLAP_M)
-    cut = restart.cut(
-        plans[1], CONFIG.tool.torch_offset_m, RUN_UP_S * CONFIG.weld_speed_m_s, CONFIG.gap.end_window_m
-    )
+    cut = restart.cut(plans[1], CONFIG.tool.torch_offset_m, RUN_UP_S * CONFIG.weld_speed_m_s, CONFIG.gap.end_window_m)
     shift = np.array((0.0, moved_m, 0.0))
     felt = None if restart.felt is None else restart.felt - np.append(shift, 0.0)
     again = welded(seam, budget, seed, GoesOn(felt), cut.line, cut.down_m)
