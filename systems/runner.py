@@ -154,8 +154,8 @@ def run_cell(
     The cell's `operator` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
     that the job goes on along the same path when the operator says so. During a weld the process is turned off first
     and the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
-    recording is shown. `diagram`: the Diagram that contains the cell's; None: the cell's own. `look` is called every 8 ms
-    of the run, beside the Diagram: it must not wait. A job's question holds the run until the operator answers it.
+    recording is shown. `diagram`: the Diagram that contains the cell's; None: the cell's own. `look` is called every
+    8 ms of the run, beside the Diagram: it must not wait. A job's question holds the run until an operator answers it.
 
     Raises:
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.

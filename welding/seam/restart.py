@@ -14,7 +14,7 @@ from weldcal.welding.seam.curve import SeamCurve
 MOVED_M = 1.0e-3  # a choice: two scans show such a move; the touch shows half of it, across the seam
 SURE = 3.0  # sigma of the difference of two registrations, below which no part has moved
 BEHIND_M = 4.0e-3  # a choice: half a weld pool and the tip's radius, so that the tip meets the open groove
-_KNOT_M = 0.5e-3
+_KNOT_M = 0.5e-3  # as the pieces of an interrupted seam
 
 
 class PartMoved(WeldcalError):

@@ -24,7 +24,7 @@ RESTART: Final = "restart"
 """Folder of a result with the files of its scenario, from which the weld can go on."""
 EVERY_M, EVERY_S = 0.5e-3, 0.5  # a choice: with the time of writing a kill loses less than 1 mm at 16 mm/s
 _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need again
-_SPACING_M = 0.2e-3
+_SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
 _LONGEST_LAG_M = 2.0e-3  # a choice: the farthest that friction has held a tip back
 
 

@@ -16,8 +16,8 @@ from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
 
 NOT_HOME = (
-    "The arm may still be at the broken seam, and its way home past the part is not checked: move it to home_deg with the"
-    " pendant, then resume the weld again."
+    "The arm may still be at the broken seam, and its way home past the part is not checked: move it to home_deg with"
+    " the pendant, then resume the weld again."
 )
 SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
