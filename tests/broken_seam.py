@@ -36,7 +36,7 @@ from weldcal.welding.servo.step import welding_step
 
 UP = np.array((0.0, 0.0, 1.0))
 SEAMS = {"straight": arcs((0.12, 0.0), spacing=2e-3), "s": s_curve(), "corner": corner(0.020, 60.0, -1.0, 0.06)}
-KINDS = ("pause", "stop", "kill")
+KINDS = ("stop", "kill", "pause")
 """Pause: an operator holds the weld and lets it go on. Stop: what stands in the file is the newest. Kill: it is up to
 EVERY_M older, as after a loss of power."""
 OVERLAP_M, PAUSE_OVERLAP_M, NEAR_M = 8e-3, 5e-3, 8e-3
