@@ -66,19 +66,20 @@ class Restart:
                 " does not go on. Put the part back, or weld the rest by hand."
             )
 
-    def cut(self, seam: SeamCurve, chord_m: float, run_up_m: float, window_m: float) -> "CutSeam":
+    def cut(self, seam: SeamCurve, chord_m: float, run_up_m: float, window_m: float, from_m: float = 0.0) -> "CutSeam":
         """The rest of a seam, from `overlap_m` before its crater.
 
         Args:
             seam: the planned line in B, with what the groove goes on behind it.
             chord_m: from torch to tip; run_up_m: of the torch before its start.
             window_m: the tip must come down so far before the groove's end.
+            from_m: where on the whole seam the line begins.
 
         Raises:
             NoRoomBehindCrater: the tip cannot touch the open groove.
         """
         if self.p_BCrater is None:
-            return CutSeam(seam, None, 0.0, 0.0)
+            return CutSeam(seam, None, from_m, from_m)
         crater = float(seam.project(self.p_BCrater))
         start = min(max(0.0, crater - self.overlap_m), seam.length)
         last = seam.drawn_m if seam.drawn_m > seam.length + window_m else seam.length
@@ -91,11 +92,11 @@ class Restart:
         s = np.linspace(start, seam.drawn_m, max(9, round((seam.drawn_m - start) / _KNOT_M)))
         length = seam.length - start if seam.length < seam.drawn_m else None
         line = SeamCurve.from_points(seam.position(s), up=seam.up(s), length=length)
-        return CutSeam(line, down - start, start, crater)
+        return CutSeam(line, down - start, from_m + start, from_m + crater)
 
 
 class CutSeam(NamedTuple):
-    """The rest of a seam in B, where on it the tip comes down (None: as usual), and start and crater on the seam, m."""
+    """The rest of a seam in B, where on it the tip comes down (None: as usual), start and crater on the whole, m."""
 
     line: SeamCurve
     down_m: float | None

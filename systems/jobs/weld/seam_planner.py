@@ -337,32 +337,24 @@ def gone_on(
     sigma_m: float,
     arc: float | None,
 ) -> tuple[SeamPlanning, SeamCurve, float | None, dict[str, Any]]:
-    """The rest of a broken seam, where the weld goes on; every other seam as it is.
+    """The rest of a broken seam, where the weld goes on; every other seam as it is, with its `arc` of the touch.
 
-    Returns:
-        The planning, the line, where the tip comes down on it (`arc`, where it is another seam), and further values of
-        the PlannedSeam.
+    Returns the planning, the line, where the tip comes down on it, and further values of the PlannedSeam.
 
     Raises:
         PartMoved, NoRoomBehindCrater: see Restart.
     """
-    begins = {"begins_m": float(whole.project(seam.position(0.0)))}
+    from_m, config = float(whole.project(seam.position(0.0))), planning.config
     if planning.restart is None or not planning.goes_on():
-        return planning, seam, arc, begins
+        return planning, seam, arc, {"begins_m": from_m}
     planning.restart.check_unmoved(whole, X_BP, sigma_m)
-    config = planning.config
-    cut = planning.restart.cut(seam, planning.tool.chord_m, RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m)
-    begun = {**begins, "question": cut.question(planning.number)}
+    run_up_m, window_m = RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
+    cut = planning.restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
+    again = {"begins_m": cut.start_m, "question": cut.question(planning.number)}
     if cut.down_m is None:
-        return planning, seam, arc, begun
-    from_m = begins["begins_m"]
-    words = cut._replace(start_m=from_m + cut.start_m, crater_m=from_m + cut.crater_m)
-    begun = {
-        "begins_m": words.start_m,
-        "felt_before": planning.restart.felt,
-        "question": words.question(planning.number),
-    }
-    return dc.replace(planning, config=leaning(config, 0.0, cut.down_m)), cut.line, cut.down_m, begun
+        return planning, seam, arc, again
+    again["felt_before"] = planning.restart.felt
+    return dc.replace(planning, config=leaning(config, 0.0, cut.down_m)), cut.line, cut.down_m, again
 
 
 def added_variance(
