@@ -14,6 +14,7 @@ from weldcal.welding.seam.curve import SeamCurve
 MOVED_M = 1.0e-3  # a choice: two scans show such a move; the touch shows half of it, across the seam
 SURE = 3.0  # sigma of the difference of two registrations, below which no part has moved
 BEHIND_M = 4.0e-3  # a choice: half a weld pool and the tip's radius, so that the tip meets the open groove
+SPARE_M = 0.5e-3  # a choice: the rest is splined anew, and its length changes by less
 _KNOT_M = 0.5e-3  # as the pieces of an interrupted seam
 
 
@@ -83,11 +84,11 @@ class Restart:
         crater = float(seam.project(self.p_BCrater))
         start = min(max(0.0, crater - self.overlap_m), seam.length)
         last = seam.drawn_m if seam.drawn_m > seam.length + window_m else seam.length
-        down = min(start + chord_m - run_up_m, last - window_m)
+        down = min(start + chord_m - run_up_m, last - window_m - SPARE_M)
         if down < crater + BEHIND_M:
             raise NoRoomBehindCrater(
                 f"The crater is {1e3 * (last - crater):.0f} mm before the groove's end, and the tip needs"
-                f" {1e3 * (BEHIND_M + window_m):.0f} mm to touch it: weld the rest by hand."
+                f" {1e3 * (BEHIND_M + window_m + SPARE_M):.1f} mm to touch it: weld the rest by hand."
             )
         s = np.linspace(start, seam.drawn_m, max(9, round((seam.drawn_m - start) / _KNOT_M)))
         length = seam.length - start if seam.length < seam.drawn_m else None

@@ -8,7 +8,7 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.restart import BEHIND_M, MOVED_M, NoRoomBehindCrater, PartMoved, Restart
+from weldcal.welding.seam.restart import BEHIND_M, MOVED_M, SPARE_M, NoRoomBehindCrater, PartMoved, Restart
 
 SEAM = SeamCurve.from_points(np.column_stack([np.linspace(0.0, 0.2, 41), np.zeros(41), np.zeros(41)]))
 CHORD_M, RUN_UP_M, WINDOW_M = 0.060, 0.016, 0.006
@@ -39,10 +39,10 @@ def test_a_crater_near_the_start_begins_the_seam_anew() -> None:
 
 
 def test_the_tip_touches_the_open_groove_or_nothing() -> None:
-    last = SEAM.length - WINDOW_M - BEHIND_M
+    last = SEAM.length - WINDOW_M - BEHIND_M - SPARE_M
     cut = broken_at(last - 1e-4).cut(SEAM, CHORD_M, RUN_UP_M, WINDOW_M)
     assert cut.down_m is not None
-    assert cut.start_m + cut.down_m == pytest.approx(SEAM.length - WINDOW_M, abs=1e-6)
+    assert cut.start_m + cut.down_m == pytest.approx(SEAM.length - WINDOW_M - SPARE_M, abs=1e-6)
     with pytest.raises(NoRoomBehindCrater, match="weld the rest by hand"):
         broken_at(last + 1e-4).cut(SEAM, CHORD_M, RUN_UP_M, WINDOW_M)
 
