@@ -177,7 +177,7 @@ def run_job(
                     _set_the_scene(meshcat, camera, target, scenario.base.pose())
                 if source is not None:
                     source.facts = facts_of(cell, options.scenario, robot.title)
-                run = run_cell(cell, told, meshcat, options.realtime, ended, **({} if look is None else {"look": look}))
+                run = run_cell(cell, told, meshcat, options.realtime, ended, *(() if look is None else (None, look)))
                 if recorder is not None:
                     recorder.close(run)
     return JobRun(run, meshcat, robot.title, live)
