@@ -41,6 +41,12 @@ def write_apart(path: Path, content: str | bytes) -> None:
     _replace(path, content.encode() if isinstance(content, str) else content)
 
 
+def write_durable(path: Path, content: str | bytes) -> None:
+    """Write a file as ``write_apart`` does, so that it also survives a loss of power from now on."""
+    write_apart(path, content)
+    _to_disk(path.parent)
+
+
 def write_npz(path: Path, **arrays: Any) -> None:
     """Write arrays as a compressed NPZ file, as ``write_atomic`` does."""
     import numpy as np  # the command line's help does without it

@@ -130,6 +130,7 @@ class JobCommand(Message):
     view: int = 0  # number of the newest scan of the workpiece, from 0
     views: int = 1  # number of scans that one plan is made from
     piece: int = 0  # number of its piece, where it is interrupted
+    question: str = ""  # that an operator must answer before the job goes on
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -259,6 +260,10 @@ class PlannedSeam(Message):
     records: tuple[SeamRecord, ...] = ()  # of this plan, the last, and those before it
     more: bool = False  # another piece of this seam follows
     touch_arc_m: float | None = None  # where the tip comes down; None: near the start
+    part_sigma_m: float = np.nan  # of the part's registration alone
+    begins_m: float = 0.0  # of the whole seam, at the plan's start
+    felt_before: NDArray[np.float64] | None = None  # (N, 4) m in B: points of an earlier run, and their lag
+    question: str = ""  # that an operator must answer before the arm goes there
     summary: str = ""  # the result of the scan, in one sentence
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and
     # torch at one place

@@ -11,6 +11,7 @@ from typing import TextIO
 
 HOLD, GO_ON = "h", "g"
 KEYS = f"Type {HOLD} and Enter to hold the arm, {GO_ON} and Enter to go on, Ctrl-C to end."
+ANSWERS = f"Type {GO_ON} and Enter for yes, Ctrl-C to end."
 SLOWEST, FASTEST = 0.0, 3.0
 """Real-time rates of a simulation that may be asked for; 0 is as fast as it goes."""
 
@@ -20,7 +21,8 @@ class Operator:
 
     The Diagram reads them in its OperatorPanel, which makes them an input of the run.
 
-    `stands`: the run loop keeps the arm at rest now. `held_by`, `ended_by`: from where that was asked for.
+    `stands`: the run loop keeps the arm at rest now. `held_by`, `ended_by`: from where that was asked for. `question`:
+    what the run asks; the hold lasts until it is answered. `answered`: the question that `go_on` answered last.
     """
 
     def __init__(self) -> None:
@@ -28,6 +30,7 @@ class Operator:
         self._pace: float | None = None
         self.held_by, self.ended_by = "", ""
         self.stands = False
+        self.question, self.answered = "", ""
 
     @property
     def holds(self) -> bool:
@@ -50,8 +53,14 @@ class Operator:
             self.held_by = by
         self._holds.set()
 
+    def ask(self, question: str) -> None:
+        """Hold the run until an operator answers a question with `go_on`."""
+        self.question = question
+        self.hold("a question")
+
     def go_on(self) -> None:
         """Continue along the same path, from where the arm is; a weld goes back a little first."""
+        self.answered, self.question = self.question or self.answered, ""
         self._holds.clear()
 
     def end(self, by: str = "the terminal") -> None:

@@ -13,6 +13,7 @@ TEXT = {
     "move_to_scan": "to the next scan pose",
     "scan_workpiece": "scan the workpiece",
     "leave_scan": "home",
+    "confirm": "a question",
     "approach_above": "approach",
     "approach": "approach",
     "weld": "track the seam and weld",
@@ -54,7 +55,7 @@ STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
     ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
     ("Park", None, ("start", "move_home", "park")),
     ("Scan the part", "weld", ("move_to_scan", "scan_workpiece", "leave_scan")),
-    ("Approach", "weld", ("approach_above", "approach")),
+    ("Approach", "weld", ("confirm", "approach_above", "approach")),
     ("Weld", "weld", ("weld",)),
     ("Go home", "weld", ("retract", "home")),
 )

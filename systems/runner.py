@@ -17,7 +17,7 @@ from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.interrupts import SIGTERM, deferred
 from weldcal.systems.messages import Image, JobCommand, Scan
-from weldcal.systems.operator import KEYS
+from weldcal.systems.operator import ANSWERS, KEYS
 from weldcal.systems.pacing import (
     HostTiming,
     measure_host,
@@ -143,6 +143,7 @@ def run_cell(
     realtime: bool = False,
     ended: Callable[[Run[JobOf]], None] = _nothing,
     diagram: Diagram | None = None,
+    look: Callable[[Run[JobOf]], None] = _nothing,
 ) -> Run[JobOf]:
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
@@ -153,7 +154,8 @@ def run_cell(
     The cell's `operator` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
     that the job goes on along the same path when the operator says so. During a weld the process is turned off first
     and the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
-    recording is shown. `diagram`: the Diagram that contains the cell's; None: the cell's own.
+    recording is shown. `diagram`: the Diagram that contains the cell's; None: the cell's own. `look` is called every
+    8 ms of the run, beside the Diagram: it must not wait. A job's question holds the run until an operator answers it.
 
     Raises:
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.
@@ -196,6 +198,9 @@ def run_cell(
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()
         command = cell.job.command(root)
+        look(run)
+        if command.question and command.question not in (operator.question, operator.answered):
+            operator.ask(command.question)
         if _process_on(cell, root) != lit:
             lit = not lit
             _keep_picture(run, root, command.seam)
@@ -257,7 +262,8 @@ def _stand(run: Run[JobOf], progress: Progress) -> None:
     """Keep the arm at rest and the Diagram's time where it is until the operator lets the job go on, or ends it."""
     operator = run.cell.operator
     phase, share = run.cell.job.stage(run.root, run.phases)
-    progress(f"held by an operator ({phase}). {KEYS}", share)
+    held = f"{operator.question} {ANSWERS}" if operator.question else f"held by an operator ({phase}). {KEYS}"
+    progress(held, share)
     run.held_by_person += 1
     operator.stands = True
     try:

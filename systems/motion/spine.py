@@ -37,9 +37,11 @@ class OperatorPanel(LeafSystem):
         - hold
         - end
         - pace
+        - answered
 
     `hold` (1) is 1.0 while an operator holds the run. `end` (1) is 1.0 once an operator has ended it, for good. `pace`
-    (1) is the requested real-time rate, 0 to 3; other values are ignored. A click of the viewer's button holds the run.
+    (1) is the requested real-time rate, 0 to 3; other values are ignored. `answered` (1) is 1.0 once an operator has
+    answered the run's question with Go on. A click of the viewer's button holds the run.
     Any page of this computer's browsers can reach the viewer, so that nothing there may let it go on.
     """
 
@@ -50,12 +52,13 @@ class OperatorPanel(LeafSystem):
         if meshcat is not None:
             meshcat.AddButton(HOLD_BUTTON, "Escape")
             meshcat.AddSlider(PACE_SLIDER, 0.0, FASTEST, 0.1, pace)
-        self._hold, self._end = self.DeclareDiscreteState(1), self.DeclareDiscreteState(1)
+        self._hold, self._end, self._answered = (self.DeclareDiscreteState(1) for _ in range(3))
         self._pace = self.DeclareDiscreteState([pace])
         self._seen = self.DeclareDiscreteState([0.0, pace])  # clicks, and the pace that was asked for
         self.DeclareStateOutputPort("hold", self._hold)
         self.DeclareStateOutputPort("end", self._end)
         self.DeclareStateOutputPort("pace", self._pace)
+        self.DeclareStateOutputPort("answered", self._answered)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
 
     def _read(self, context: Context, discrete: DiscreteValues) -> None:
@@ -74,6 +77,7 @@ class OperatorPanel(LeafSystem):
         elif asked != before:
             pace = asked
         discrete.set_value(self._hold, [float(operator.holds)])
+        discrete.set_value(self._answered, [float(bool(operator.answered))])
         discrete.set_value(self._pace, [pace])
         discrete.set_value(self._seen, [clicks, asked])
         if operator.ends:  # for good
@@ -254,7 +258,7 @@ class SpineArm:
 class Spine:
     """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it.
 
-    `switch` outputs `process_on` and `arm_stopped`.
+    `switch` outputs `process_on` and `arm_stopped`. `answered` (1): see OperatorPanel; None without an operator.
     """
 
     wiring: Wiring
@@ -262,6 +266,7 @@ class Spine:
     hold: OutputPort
     end: OutputPort
     switch: ProcessSwitch
+    answered: OutputPort | None = None
 
     @property
     def arm(self) -> SpineArm:
@@ -277,6 +282,7 @@ class Spine:
             "robot_status": first.status,
             "history": first.history,
             "hold": self.end,
+            **({} if self.answered is None else {"answered": self.answered}),
         }
         known = {name: port for name, port in known.items() if procedure.HasInputPort(name)}
         self.wiring.connect(procedure, **known, **sources)
@@ -358,16 +364,16 @@ def add_spine(
                 error=own_error,
             )
         )
-    hold, end = _operator(w)
-    return Spine(w, tuple(made), hold, end, w.add("process_switch", ProcessSwitch()))
+    hold, end, answered = _operator(w)
+    return Spine(w, tuple(made), hold, end, w.add("process_switch", ProcessSwitch()), answered)
 
 
-def _operator(w: Wiring) -> tuple[OutputPort, OutputPort]:
-    """What an operator asks for, or asked for in a recording that is played back: to hold, to end."""
+def _operator(w: Wiring) -> tuple[OutputPort, OutputPort, OutputPort | None]:
+    """What an operator asks for, or asked for in a recording that is played back: to hold, to end; and the answer."""
     if all(w.station.diagram.HasOutputPort(name) for name in (HOLD, END)):
-        return w.out(HOLD), w.out(END)
+        return w.out(HOLD), w.out(END), None
     if w.operator is None:
-        return w.zeros("nobody_holds", 1), w.zeros("nobody_ends", 1)
+        return w.zeros("nobody_holds", 1), w.zeros("nobody_ends", 1), None
     panel = w.add("operator_panel", OperatorPanel(w.operator, w.meshcat))
     w.read[HOLD], w.read[END] = panel.GetOutputPort("hold"), panel.GetOutputPort("end")
-    return w.read[HOLD], w.read[END]
+    return w.read[HOLD], w.read[END], panel.GetOutputPort("answered")

@@ -5,7 +5,7 @@ import json
 import platform
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -111,8 +111,16 @@ class JobRun:
             write_atomic(folder / "recording.html", page)
 
 
-def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> JobRun:
+def run_job(
+    scenario: Scenario,
+    options: RunOptions,
+    progress: Progress,
+    key: str | None = None,
+    look: Callable[[Run[Any]], None] | None = None,
+) -> JobRun:
     """Build the cell and run its job to the end; `key` is the key of the required job, None: any job.
+
+    `look`: see run_cell.
 
     Raises:
         InputError: the scenario has another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell;
@@ -169,7 +177,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                     _set_the_scene(meshcat, camera, target, scenario.base.pose())
                 if source is not None:
                     source.facts = facts_of(cell, options.scenario, robot.title)
-                run = run_cell(cell, told, meshcat, options.realtime, ended)
+                run = run_cell(cell, told, meshcat, options.realtime, ended, *(() if look is None else (None, look)))
                 if recorder is not None:
                     recorder.close(run)
     return JobRun(run, meshcat, robot.title, live)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import typer
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.calibrate import KINEMATICS_FILE
@@ -24,6 +25,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
+from weldcal.tools.commands.broken_weld import OverlapOption, ResumeOption, broken_weld, keeper_of
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
 from weldcal.tools.report.files import write_json
@@ -31,6 +33,7 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.tools.report.weld_record import part_record, weld_record
+from weldcal.welding.record.progress import Progress as WeldProgress
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 
 SCANS: Final = "scans"
@@ -40,8 +43,25 @@ PRESET: Final = "straight_groove"
 
 
 @command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
-def weld(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = PRESET) -> Outcome:
-    """Weld a seam in a scenario, with the scanner's pose taken from the scenario."""
+def weld(
+    call: Call,
+    name: ScenarioArgument = None,
+    scenario: ScenarioOption = PRESET,
+    resume: ResumeOption = None,
+    overlap_mm: OverlapOption = 8.0,
+) -> Outcome:
+    """Weld a seam in a scenario, with the scanner's pose taken from the scenario.
+
+    With --resume a broken weld goes on from its crater: the part is scanned again, and the arc starts after your yes.
+    """
+    if resume is not None:
+        if name is not None or scenario != PRESET:
+            raise typer.BadParameter("--resume takes the scenario from its folder: give no other")
+        broken = broken_weld(resume, overlap_mm, call.live)
+        call.seed = broken.progress.seed
+        options = run_options(call, "weld", broken.progress.scenario, **broken.options)
+        found = run_scenario(broken.scenario, options, call.progress, broken.progress)
+        return Outcome(found.summary(), first=found.first)
     found = run_weld(run_options(call, "weld", named_once(name, scenario, PRESET)), call.progress)
     return Outcome(found.summary(), first=found.first)
 
@@ -86,21 +106,31 @@ def known_camera(name: str) -> Scenario:
     return scenario
 
 
-def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Build and run the cell, evaluate the run and write its results.
+def run_scenario(
+    scenario: Scenario, options: RunOptions, progress: Progress = no_progress, earlier: WeldProgress | None = None
+) -> DemoResult:
+    """Build and run the cell, evaluate the run and write its results; `earlier`: of the weld that it goes on with.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
     """
-    finished = run_job(scenario, options, progress, "")
+    keeper = keeper_of(scenario, options, earlier)
+    try:
+        finished = run_job(scenario, options, progress, "", None if options.dry_run else keeper.look)
+    except BaseException:
+        keeper.close()
+        raise
+    keeper.close(finished.run)
     progress("measure and write", finished.share(0.985))
-    result = measure(finished.run, options, finished.robot)
+    result = measure(finished.run, options, finished.robot, keeper.progress)
     write_result(result, finished)
     return result
 
 
-def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
-    """Compare the run with the ground truth of its simulation."""
+def measure(
+    run: Run[WeldJob], options: RunOptions, robot: str = "simulated", progress: WeldProgress | None = None
+) -> DemoResult:
+    """Compare the run with the ground truth of its simulation; `progress`: how far the weld has come."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
     error = (
         None
@@ -109,8 +139,17 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
     )
     weld = weld_outcome(cell, run.root)
     log = None if weld is None else weld_record(run, weld, options.seed, options.scenario, robot)
-    record = None if log is None else part_record(run, log)
-    return DemoResult(options=options, run=run, status=status, calibration=error, weld=weld, robot=robot, record=record)
+    record = None if log is None else part_record(run, log, progress)
+    return DemoResult(
+        options=options,
+        run=run,
+        status=status,
+        calibration=error,
+        weld=weld,
+        robot=robot,
+        record=record,
+        broken=progress is not None and bool(progress.stretches) and not progress.done,
+    )
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:

@@ -156,6 +156,8 @@ class DashboardSource:
             return state, reason or "The job is complete."
         if operator.ends:
             return STOPPING, f"ended by {operator.ended_by}; the process goes off and the arm comes to rest"
+        if operator.stands and operator.question:
+            return HELD, f"{operator.question} Go on is yes, End is no."
         if operator.stands:
             return HELD, f"by {operator.held_by}, during: {doing}. {self._go_on_line()}"
         if operator.holds:

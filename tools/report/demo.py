@@ -58,6 +58,7 @@ class DemoResult:
     calibration: CalibrationError | None
     weld: WeldOutcome | None
     record: PartRecord | None = None
+    broken: bool = False  # a seam, or the seams after it, are not welded yet
     robot: str = "simulated"
 
     @property
@@ -183,6 +184,11 @@ class DemoResult:
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
         if self.state == "held":
+            if self.broken:
+                return Next(
+                    "Remove the cause that is named above, and move the arm home. Then go on from the crater.",
+                    f"weldcal weld --resume {folder}",
+                )
             if self.weld is None and not self.n_scans:
                 return after_hold(self.run.ended_by_operator)
             return after_hold(

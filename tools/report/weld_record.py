@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.runner import Run
@@ -18,7 +19,8 @@ from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
 from weldcal.welding.record.process import speed_along, torch_angles
-from weldcal.welding.record.weld_log import WeldRecord
+from weldcal.welding.record.progress import Progress
+from weldcal.welding.record.weld_log import WeldRecord, load_weld_log
 from weldcal.welding.record.welded_seam import (
     MEASURED,
     RECORD_COLUMNS,
@@ -52,17 +54,25 @@ _SOURCES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PartRecord:
-    """The record of a part: its order, its weld log, the welded seams, and PNG pictures by name."""
+    """The record of a part: its order, its weld log, the welded seams, and PNG pictures by name.
+
+    `stretches`: rows of what was welded without a break; `lost`: a sentence for each stretch without a log.
+    """
 
     order: WeldOrder
     log: WeldRecord
     seams: tuple[WeldedSeam, ...]
     pictures: dict[str, bytes]
     plots: dict[int, bytes]  # of the arc, by the seam's number from 1
+    stretches: Sequence[dict[str, object]] = ()
+    lost: tuple[str, ...] = ()
 
     @property
     def outside(self) -> list[str]:
-        """A sentence for each limit that a seam exceeds."""
+        """A sentence for each limit that a seam exceeds, and for each stretch that nothing is known of."""
+        return [*self.lost, *self._outside()]
+
+    def _outside(self) -> list[str]:
         return [
             f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
             f" {_limit(self.order, name)}."
@@ -127,6 +137,7 @@ class PartRecord:
             "outside_limits": self.outside,
             "process": asdict(self.log.process),
             "schedule": self.log.settings.get("schedule"),
+            "stretches": list(self.stretches),
             "seams": [
                 asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
                 for seam, row in zip(self.seams, rows, strict=True)
@@ -223,6 +234,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "law": config.law,
         "woven": bool(config.weave.amplitude_m),
         "felt": felt_seams(run),
+        "plans": [plan.seam for plan in cell.job.planned_seam(run.root).records],
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
         "schedule": None if cell.scenario.welding.schedule is None else asdict(cell.scenario.welding.schedule),
@@ -231,9 +243,15 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     return WeldRecord(table, phase, process, settings)
 
 
-def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
-    """The record of a finished run from its weld log; without a seam where no arc burned."""
-    numbers: Sequence[int] = [plan.seam for plan in run.cell.job.planned_seam(run.root).records]
+def part_record(run: Run[WeldJob], log: WeldRecord, progress: Progress | None = None) -> PartRecord:
+    """The record of a finished run from its weld log; without a seam where no arc burned.
+
+    `progress`: where the run went on with a broken weld, the record joins the logs of all its runs.
+    """
+    lost: list[str] = []
+    if progress is not None:
+        log, lost = with_earlier_logs(log, progress)
+    numbers: Sequence[int] = log.settings["plans"]
     order, of_seam = run.cell.scenario.welding.order, list(seam_rows(log, numbers))
     seams = [welded_seam(log, number, rows) for number, rows in of_seam]
     plots = {number + 1: arc_over_time(log, rows, order.limits) for number, rows in of_seam}
@@ -249,7 +267,40 @@ def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
         seams=tuple(seam for seam in seams if seam is not None),
         pictures=pictures,
         plots={number: plot for number, plot in plots.items() if plot is not None},
+        stretches=[] if progress is None else stretch_rows(progress),
+        lost=tuple(lost),
     )
+
+
+def with_earlier_logs(log: WeldRecord, progress: Progress) -> tuple[WeldRecord, list[str]]:
+    """The weld log behind those of the earlier runs of a broken weld, and a sentence for each log that is lost."""
+    lost = []
+    for k in reversed(range(len(progress.folders) - 1)):
+        welded = [one for one in progress.stretches if one.run == k]
+        try:
+            log = log.after(load_weld_log(Path(progress.folders[k])))
+            break  # it holds those before it
+        except InputError:
+            lost += [
+                f"Seam {one.seam + 1}: {1e3 * one.from_m:.0f} to {1e3 * one.to_m:.0f} mm were welded in a run whose log"
+                " is lost."
+                for one in welded
+            ]
+    return log, lost
+
+
+def stretch_rows(progress: Progress) -> list[dict[str, object]]:
+    """What record.json holds of each stretch that was welded without a break."""
+    return [
+        {
+            "seam": one.seam + 1,
+            "from_mm": round(1e3 * one.from_m, 1),
+            "to_mm": round(1e3 * one.to_m, 1),
+            "ended": one.time,
+            "folder": progress.folders[one.run],
+        }
+        for one in progress.stretches
+    ]
 
 
 def _spread(seam: WeldedSeam, name: str) -> Spread:

@@ -9,7 +9,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,6 +89,7 @@ COLUMNS: tuple[LogColumn, ...] = (
     LogColumn("set_current_A", "A", "", "current that the schedule sets; nan where it sets none"),
     LogColumn("gap_m", "m", "planned seam", "measured gap that the schedule follows; nan where it follows none"),
 )
+BETWEEN_RUNS_S = 1.0  # a choice: longer than any hold counts as time of welding; the true time is in record.json
 _LATER = (
     *("arc", "current_A", "voltage_V"),
     *("set_wire_feed_m_min", "set_voltage_V", "set_current_A", "gap_m"),
@@ -128,6 +129,21 @@ class WeldRecord:
     def arc(self) -> NDArray[np.bool_]:
         """Where the arc burned, (N,): as the power source reports it, else while the torch was on."""
         return np.asarray(self.torch_on & (np.nan_to_num(self.columns["arc"], nan=1.0) > 0.5))
+
+    def after(self, earlier: "WeldRecord") -> "WeldRecord":
+        """This record behind that of an earlier run of the same weld; its times follow those.
+
+        What that run touched last, without an arc, is left out.
+        """
+        plans = list(earlier.settings.get("plans", ()))
+        welded = np.flatnonzero(earlier.phase != "TOUCH")
+        n = int(welded[-1]) + 1 if len(welded) else 0
+        plans = plans[: int(np.sum(np.diff(np.flatnonzero(earlier.phase[:n] == "TOUCH"), prepend=-2) > 1))]
+        then = float(earlier["time_s"][n - 1]) + BETWEEN_RUNS_S if n else 0.0
+        table = {name: np.concatenate([earlier[name][:n], self[name]]) for name in self.columns}
+        table["time_s"] = np.concatenate([earlier["time_s"][:n], self["time_s"] - self["time_s"][0] + then])
+        settings = {**self.settings, "plans": [*plans, *self.settings.get("plans", ())]}
+        return replace(self, columns=table, phase=np.concatenate([earlier.phase[:n], self.phase]), settings=settings)
 
     def points(self, name: str) -> Array:
         """A point or displacement (N,3) m: "p_BW", "p_BT", "p_BTip", "p_BSeam" or "deflection"."""

@@ -22,6 +22,7 @@ from weldcal.welding.servo.contact import (
 )
 from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step, mean_residual
+from weldcal.welding.servo.felt_before import with_felt_before
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
@@ -171,6 +172,10 @@ def _touch(
         state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
+    if seated and state.touch.felt and not feels_start:
+        state, problem = with_felt_before(state, sample, config)
+        if problem is not None:
+            return _rest(fault(state, problem), config)
     state = _slewed(state, lateral, upward, config, dt)
     speed_up = config.limits.tip_acceleration_m_s2 * dt
     state = changed(state, v_tip=clip(along, state.v_tip - speed_up, state.v_tip + speed_up))

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from weldcal.welding.numerics import changed, clip, dot, pose, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.servo.contact import freshness
-from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
 from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 
 _TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
@@ -47,10 +47,11 @@ def check_length(line: SeamCurve, config: ServoConfig) -> None:
         SeamError: with the least length.
     """
     least = config.touch.arc_m + config.gap.end_window_m
-    if line.length < least:
+    # Where a plan moves the touch ahead, the groove may be touched past the seam's end.
+    room = line.drawn_m if config.touch.arc_m > TouchOnConfig.arc_m else line.length
+    if room < least:
         raise SeamError(
-            f"The seam is only {1e3 * line.length:.0f} mm long: too short for the touch-on, which needs"
-            f" {1e3 * least:.0f} mm."
+            f"The seam is only {1e3 * room:.0f} mm long: too short for the touch-on, which needs {1e3 * least:.0f} mm."
         )
 
 

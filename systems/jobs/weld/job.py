@@ -138,6 +138,7 @@ SHARES = {
     "move_to_scan": 0.32,
     "scan_workpiece": 0.33,
     "leave_scan": 0.335,
+    "confirm": 0.338,
     "approach_above": 0.34,
     "approach": 0.36,
     "weld": 0.38,

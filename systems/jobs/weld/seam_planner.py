@@ -3,7 +3,7 @@
 import dataclasses as dc
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,7 @@ from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
+from weldcal.welding.seam.restart import Restart
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -101,7 +102,12 @@ class SeamPlanning(Welder):
     pass_obstacles: bool = False  # the seam is interrupted there
     piece: int = 0  # of an interrupted seam
     number: int = 0  # of the seam
+    restart: Restart | None = None  # the weld goes on there
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
+
+    def goes_on(self) -> bool:
+        """Whether this seam, or its piece, is the broken one."""
+        return self.restart is not None and (self.restart.seam, self.restart.piece) == (self.number, self.piece)
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -176,6 +182,11 @@ class SeamPlanner(BackgroundSystem):
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+
+    def restarted(self, restart: Restart) -> Self:
+        """The same planner, which goes on with a broken weld."""
+        self._planning = dc.replace(self._planning, restart=restart)
+        return self
 
     def ask(self, context: Context, newest: PlannedSeam) -> Answer[PlannedSeam] | None:
         """Ask for the plan from a new scan of the workpiece."""
@@ -264,10 +275,11 @@ def plan_seam(
                 check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
                 if stops:
                     planning, seam, record, more = interrupted(planning, seam, stops, record)
+        arc = planning.config.touch.arc_m if record.left_out else None
+        planning, seam, arc, again = gone_on(planning, seam, whole, found.X_BP, found.sigma_m, arc)
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            arc = planning.config.touch.arc_m if record.left_out else 0.0
-            check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
+            check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc or 0.0)
         felt = is_felt(planning.workpiece, planning.tool)
         at, others = added_variance(planning, found, seam, plan, known[-1][1])
         # a turn about a ring moves it along itself
@@ -281,7 +293,9 @@ def plan_seam(
             felt=felt,
             records=(*planning.earlier, record),
             more=more,
-            touch_arc_m=planning.config.touch.arc_m if record.left_out else None,
+            touch_arc_m=arc,
+            part_sigma_m=found.sigma_m,
+            **again,
             gap=planned_gap(planning, found.fit_up, whole, seam),
             rms_m=found.rms_m,
             confidence=found.confidence,
@@ -331,6 +345,34 @@ def interrupted(
     arc = max(down - start, planning.config.touch.arc_m)
     planning = dc.replace(planning, config=leaning(planning.config, 0.0, arc))
     return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
+
+
+def gone_on(
+    planning: SeamPlanning,
+    seam: SeamCurve,
+    whole: SeamCurve,
+    X_BP: RigidTransform | None,
+    sigma_m: float,
+    arc: float | None,
+) -> tuple[SeamPlanning, SeamCurve, float | None, dict[str, Any]]:
+    """The rest of a broken seam, where the weld goes on; every other seam as it is, with its `arc` of the touch.
+
+    Returns the planning, the line, where the tip comes down on it, and further values of the PlannedSeam.
+
+    Raises:
+        PartMoved, NoRoomBehindCrater: see Restart.
+    """
+    from_m, config = float(whole.project(seam.position(0.0))), planning.config
+    if planning.restart is None or not planning.goes_on():
+        return planning, seam, arc, {"begins_m": from_m}
+    planning.restart.check_unmoved(whole, X_BP, sigma_m)
+    run_up_m, window_m = RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
+    cut = planning.restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
+    again = {"begins_m": cut.start_m, "question": cut.question(planning.number)}
+    if cut.down_m is None:
+        return planning, seam, arc, again
+    again["felt_before"] = planning.restart.felt
+    return dc.replace(planning, config=leaning(config, 0.0, cut.down_m)), cut.line, cut.down_m, again
 
 
 def added_variance(
@@ -463,9 +505,12 @@ class DrawnSeamPlanner(SeamPlanner):
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
-        seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
+        whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
+        planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
         return dc.replace(
             _planned(planning, sequence, seam, planning.X_BP_guess),
+            touch_arc_m=arc,
+            **again,
             rms_m=0.0,
             confidence=1.0,
             points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),

@@ -15,6 +15,10 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
 
+NOT_HOME = (
+    "The arm may still be at the broken seam, and its way home past the part is not checked: move it to home_deg with"
+    " the pendant, then resume the weld again."
+)
 SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
 """Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
@@ -40,6 +44,7 @@ class JobPlan:
     maximum_time_s: float = 240.0
     seams: int = 1
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
+    first: tuple[int, int] | None = None  # seam and piece with which a broken weld goes on; None: a new weld
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,6 +60,7 @@ class JobState(ProcedureState):
         seam: number of the seam that is planned and welded, from 0; piece: of that seam's pieces.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
+        question: what the operator must answer now.
     """
 
     purpose: str = ""
@@ -66,6 +72,7 @@ class JobState(ProcedureState):
     piece: int = 0
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
     warnings: tuple[str, ...] = ()
+    question: str = ""
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,6 +85,7 @@ class JobInputs(Inputs):
     servo_report: ServoReport
     arm_stopped: float = 0.0
     drift: DriftStatus = dc.field(default_factory=DriftStatus)
+    answered: float = 0.0
 
 
 def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
@@ -123,6 +131,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         - servo_report
         - arm_stopped
         - drift
+        - answered
         output_ports:
         - job
         - job_state
@@ -131,7 +140,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         - scanner_streaming
 
     `drift` (may stay open) carries the DriftMonitor's status: a scanner that has moved holds the job before the weld
-    and is a warning from then on. `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is
+    and is a warning from then on. `answered` (1; open: never) is 1 once an operator has answered the plan's question.
+    `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is
     1 after the guard stopped a weld. `job` carries the `JobCommand`, `job_state` the whole `JobState` with its log;
     `scan_trigger` and `streaming` (1) go to the station, and so does `scanner_streaming` (1) where the scanner streams:
     after the calibration it does, except while it scans.
@@ -151,7 +161,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         late = "{} arrived within {:.0f} s of its trigger. Look at the scanner."
         no_scan = (plan.scan_timeout_s, late.format("No scan", plan.scan_timeout_s))
         super().__init__(
-            JobState(),
+            JobState() if plan.first is None else JobState(seam=plan.first[0], piece=plan.first[1]),
             move_timeout_s=plan.move_timeout_s,
             maximum_time_s=plan.maximum_time_s,
             timeouts={
@@ -167,13 +177,19 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         self._plan = plan
         self.read(
             "drift",
+            "answered",
             next_pose=PoseRequest(),
             calibration_status=CalibrationStatus(),
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),
             arm_stopped=0.0,
             drift=DriftStatus(),
+            answered=0.0,
         )
+
+    def begun_at(self, seam: int, piece: int) -> "JobSequencer":
+        """Return a sequencer of the same job that begins with a later seam, or piece of one."""
+        return JobSequencer(dc.replace(self._plan, first=(seam, piece)))
 
     def attend(self, s: JobState, now: JobInputs) -> JobState:
         """See Procedure: a scanner that has moved, and the finger camera before the tip touches."""
@@ -201,6 +217,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             view=s.view,
             views=max(1, len(self._plan.scan_poses)),
             piece=s.piece,
+            question=s.question,
         )
 
     def flag(self, name: str, s: JobState) -> bool:
@@ -209,6 +226,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     def _start(self, s: JobState, now: JobInputs) -> JobState:
         if not stands_at(now.q, self._plan.q_home):
+            if self._plan.first is not None:
+                return self.held(s, now, NOT_HOME)
             return self._homeward(s, now, "move_home")
         return self._begin(s, now)
 
@@ -288,7 +307,12 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return self._approach(s, now)
 
     def _approach(self, s: JobState, now: JobInputs) -> JobState:
-        return self.go(s, now, "approach_above", now.planned_seam.q_above)
+        if now.planned_seam.question and now.answered < 0.5:
+            return self.enter(s, now, "confirm", question=now.planned_seam.question)
+        return self.go(s, now, "approach_above", now.planned_seam.q_above, question="")
+
+    def _confirmed(self, s: JobState, now: JobInputs) -> JobState:
+        return s if now.answered < 0.5 else self._approach(s, now)
 
     def _above(self, s: JobState, now: JobInputs) -> JobState:
         return self.go(s, now, "approach", now.planned_seam.q_start)
@@ -329,6 +353,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         "move_to_scan": _scan,
         "scan_workpiece": _planned,
         "leave_scan": _approach,
+        "confirm": _confirmed,
         "approach_above": _above,
         "approach": _approached,
         "weld": _welding,

@@ -17,6 +17,7 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
 from weldcal.welding.numerics import changed
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule
+from weldcal.welding.servo.felt_before import start_state
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
@@ -132,7 +133,7 @@ class WeldingVelocityServo(LeafSystem):
         X_BT = tick_flange_pose(arm, self._q.Eval(context)) @ self._tool.X_FT
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
-        memory = old.state if old.state is not None else WeldingState()
+        memory = old.state if old.state is not None else start_state(planned.felt_before)
         config = self._configs[min(job.seam, len(self._configs) - 1)]
         config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
         if self._schedule is not None:

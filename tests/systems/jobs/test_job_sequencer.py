@@ -144,7 +144,9 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.arrive() == "done"
     assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
     passed = [phase for _, phase in world.state.log]
-    assert {*PHASES, "done"} == {*passed, "move_home", "move_to_scan", "leave_scan"}, "it stood at home already"
+    assert {*PHASES, "done"} == {*passed, "move_home", "move_to_scan", "leave_scan", "confirm"}, (
+        "it stood at home already"
+    )
     assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
 
 
@@ -163,6 +165,27 @@ def test_a_part_is_scanned_from_each_pose_then_planned_once() -> None:
             assert world.look(0.3, planned_seam=PLANNED) == "leave_scan"
     assert world.command.q_goal is Q_HOME  # from where the way to the seam is planned
     assert world.arrive() == "approach_above"
+
+
+def test_a_broken_weld_waits_at_home_for_the_operators_yes() -> None:
+    plan = dc.replace(PLAN, calibrate=False, first=(1, 2))
+    world = World(plan, JobState(phase="scan_workpiece", goal_id=5, trigger=1, seam=1))
+    asks = dc.replace(PLANNED, question="Start?")
+    assert world.look(0.3, planned_seam=asks) == "confirm"
+    assert world.look(60.0) == "confirm", "no time is an answer"
+    assert (world.command.question, world.command.mode, world.command.process_on) == ("Start?", "hold", False)
+    assert world.look(0.1, answered=1.0) == "approach_above"
+    assert world.command.question == ""
+
+
+def test_a_broken_weld_begins_with_its_seam_and_only_at_home() -> None:
+    system = JobSequencer(dc.replace(PLAN, calibrate=False)).begun_at(1, 2)
+    first = system.state_in(system.CreateDefaultContext())
+    assert (first.seam, first.piece) == (1, 2)
+    away = World(dc.replace(PLAN, calibrate=False, first=(0, 0)))
+    assert away.look(q=Q_HOME + 0.2) == "held"
+    assert "with the pendant" in (away.command.reason or "")
+    assert World(dc.replace(PLAN, calibrate=False)).look(q=Q_HOME + 0.2) == "move_home"
 
 
 def test_a_scan_without_the_arms_pose_holds_the_job_at_once() -> None:

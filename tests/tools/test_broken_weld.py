@@ -1,0 +1,69 @@
+"""A broken weld is resumed only where it can be: not twice, not complete, not changed, and never without a yes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.places import ROOT
+from weldcal.models.result_files import write_apart
+from weldcal.systems.jobs.weld.progress_keeper import RESTART, sha256_of
+from weldcal.systems.recording.scenario_files import packed
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.cli.app import app
+from weldcal.welding.record.progress import Progress
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    files = packed(load_scenario("straight_groove"))
+    for name, data in files.items():
+        write_apart(tmp_path / RESTART / name, data)
+    state(tmp_path).write(tmp_path)
+    return tmp_path
+
+
+def state(folder: Path, **changes: object) -> Progress:
+    files = {path.name: path.read_bytes() for path in (folder / RESTART).iterdir()}
+    begun = Progress(
+        scenario="straight_groove", seed=1, robot=None, scenario_sha256=sha256_of(files), folders=(str(folder),)
+    )
+    return replace(begun, **changes)  # type: ignore[arg-type]
+
+
+def resumed(folder: Path, *more: str) -> str:
+    done = CliRunner().invoke(app, ["weld", "--resume", str(folder), "--out", str(folder / "out"), *more])
+    assert done.exit_code in (1, 2), done.output
+    assert not (folder / "out").exists()
+    return " ".join(done.output.split())
+
+
+def test_an_arc_needs_somebody_who_says_yes(broken: Path) -> None:
+    assert "nobody could give it: run the command in a terminal" in resumed(broken, "--no-browser")
+    assert "nobody could give it" in resumed(broken, "--json")
+
+
+def test_what_cannot_go_on_is_refused(broken: Path) -> None:
+    assert "omit it" in resumed(broken, "--dry-run")
+    assert "give no other" in resumed(broken, "--scenario", "s_groove")
+    state(broken, done=True).write(broken)
+    assert "is complete" in resumed(broken)
+    state(broken, continued_in="/there").write(broken)
+    assert "has gone on in '/there'" in resumed(broken)
+    state(broken).write(broken)
+    (broken / RESTART / "scenario.yaml").write_text("extends: straight_groove\n")
+    assert "is not that of the broken weld" in resumed(broken)
+    assert "holds no broken weld" in resumed(broken / RESTART)
+
+
+def test_a_weld_whose_process_was_killed_goes_on() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.restarted", "1", "4", "power"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
+    assert "1 stops, 0 bad, 0 arcs without a question" in done.stdout
