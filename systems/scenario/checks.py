@@ -33,6 +33,8 @@ POSITIVE = {
         "length_mm",
         "hole_from_mm",
         "bend_radius_mm",
+        "on_mm",
+        "off_mm",
     ),
     *("maximum_time_s", "control_period_s", "following_error_rad"),
     *("pace", "velocity_share", "spread_deg", "travel_deg"),
@@ -40,7 +42,7 @@ POSITIVE = {
 }
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
-    *("repeatability_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
+    *("repeatability_mm", "from_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg", "margin_m"),
 }
@@ -270,6 +272,8 @@ def check_scenario(scenario: Scenario) -> None:
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
+    if scenario.welding.stitch is not None:
+        scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration

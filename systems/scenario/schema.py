@@ -17,6 +17,7 @@ from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
@@ -169,6 +170,19 @@ class WeaveOrder:
 
 
 @dc.dataclass
+class StitchOrder:
+    """Stitches: the arc burns along pieces of the seam only."""
+
+    on_mm: float = 30.0  # length of a piece; the seam's end may cut the last one to a half, a shorter rest is left out
+    off_mm: float = 60.0  # from the end of a piece to the start of the next one
+    from_mm: float = 0.0  # where the first piece starts, so that both sides of a web can be staggered
+
+    def stitch(self) -> StitchConfig:
+        """The order as a StitchConfig."""
+        return StitchConfig(on_m=1e-3 * self.on_mm, off_m=1e-3 * self.off_mm, from_m=1e-3 * self.from_mm)
+
+
+@dc.dataclass
 class ArcConfig:
     """How the arc starts and ends."""
 
@@ -225,6 +239,7 @@ class WeldingConfig:
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
+    stitch: StitchOrder | None = None  # null: the arc burns along the whole seam
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must

@@ -236,6 +236,7 @@ class DemoResult:
             found["heat_input_kJ_mm"] = None if heat is None else heat[0]
         if self.record is not None:
             found |= self.record.summary()
+            found["arc_mm"] = [seam.arc_mm for seam in self.record.seams]
         if self.weld is not None and self.weld.weave:
             found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
         if self.weld is not None:

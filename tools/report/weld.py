@@ -253,7 +253,8 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
             path[on] = curve.position(off.s) + (off.lateral * curve.normal(off.s).T + off.height * curve.up(off.s).T).T
         if true is not None:
             errors.append(off)
-    speed = _together([speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in parts])
+    stretches = parts if not cell.job.servo_config.stitch.on_m else [b for p in parts for b in burns(log, p)]
+    speed = _together([speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in stretches])
     outcome = WeldOutcome(
         log=log,
         true_seam=seam,
@@ -339,6 +340,14 @@ def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
     touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
     number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
     return [number == k for k in range(int(number[-1]) + 1)]
+
+
+def burns(log: WeldLog, part: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Masks (N,) of the stretches of a part (N,) along which the torch was on without a pause."""
+    on = part & log.torch_on
+    number = np.cumsum(on & ~np.concatenate([[False], on[:-1]]))
+    found = [on & (number == k) for k in range(1, int(number[-1]) + 1)]
+    return [stretch for stretch in found if stretch.sum() >= 30]
 
 
 def felt_seams(run: Run[WeldJob]) -> list[bool]:

@@ -36,6 +36,7 @@ class WeldedSeam:
         arc_values: measured (by the power source), set (as ordered of it), or unknown.
         figures: by the names of RANGES, over stretches of 10 mm; their means over the seam.
         path_mm: distance of the torch from the felt seam: mean and largest.
+        arc_mm: where along the planned seam the arc burned, (from, to) of each stretch.
     """
 
     seam: int
@@ -44,6 +45,7 @@ class WeldedSeam:
     arc_values: str
     figures: dict[str, Spread]
     path_mm: Spread
+    arc_mm: tuple[tuple[float, float], ...] = ()
 
     def outside(self, limits: OrderLimits) -> tuple[str, ...]:
         """Names of the limits that the seam exceeds, or that nothing is known of."""
@@ -78,6 +80,7 @@ def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> Wel
         return None
     time = record["time_s"]
     dt = np.diff(time[on])
+    burned = np.split(1e3 * record["s_torch_m"][on], np.flatnonzero(dt > GAP_S) + 1)
     dt = np.where(dt > GAP_S, 0.0, dt)
     length = record["torch_speed_m_s"][on][:-1] * dt
     if record.settings.get("woven"):  # metal is deposited along the seam, not along the swings
@@ -100,6 +103,7 @@ def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> Wel
         arc_values=source,
         figures={name: _spread(*table, stretch) for name, table in tables.items()},
         path_mm=Spread(*map(float, (off.min(), off.mean(), off.max()))) if len(off) else Spread(),
+        arc_mm=tuple((float(np.nanmin(s)), float(np.nanmax(s))) for s in burned if np.isfinite(s).any()),
     )
 
 

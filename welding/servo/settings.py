@@ -14,6 +14,7 @@ from weldcal.welding.numerics import Array
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.seam.plan_fit import PlanFitConfig
 from weldcal.welding.seam.refinement import RefinementConfig
+from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.weave import Bound, WeaveConfig, check_weave, tool_bounds
 
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
@@ -342,6 +343,7 @@ class ServoConfig:
     plan_fit: PlanFitConfig = field(default_factory=PlanFitConfig)
     windows: SeamWindows = field(default_factory=SeamWindows)
     weave: WeaveConfig = field(default_factory=WeaveConfig)
+    stitch: StitchConfig = field(default_factory=StitchConfig)
     weld_speed_m_s: float = 8.0e-3
     period_s: float = 0.008
     lag_s: float = 0.025
@@ -355,6 +357,7 @@ class ServoConfig:
         _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
+        self.stitch.check(self.weld_speed_m_s)
         if self.weave.amplitude_m:
             check_weave(self.weave, self.weave_bounds(self.weave))
 

@@ -182,6 +182,7 @@ class WeldingState:
     advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
     lit_at: float = math.nan
+    stitched_to: float = 0.0
     weave: Learnt = field(default_factory=Learnt)
     arc_seen: bool = False
     arc_waited_s: float = 0.0

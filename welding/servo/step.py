@@ -25,6 +25,7 @@ from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, fee
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.stitch import Piece
 from weldcal.welding.servo.touch import check_length, touch_step
 from weldcal.welding.servo.track import torch_target, weaving
 
@@ -35,6 +36,20 @@ def start_arc(state: WeldingState, curve: SeamCurve) -> float:
     The measured start of the groove, else the planned one.
     """
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
+
+
+def current_piece(state: WeldingState, config: ServoConfig) -> Piece | None:
+    """Return the piece of the seam that is welded, or will be next; None after the last one."""
+    assert state.plan_fit is not None
+    start = start_arc(state, state.plan_fit.curve)
+    return config.stitch.piece(max(state.stitched_to, start), start, state.s_end)
+
+
+def stitched(state: WeldingState, config: ServoConfig) -> WeldingState:
+    """Return the state after a piece: the arc off, and not seen yet in the next one."""
+    piece = current_piece(state, config)
+    to = state.s_end if piece is None else piece.end
+    return changed(state, torch_on=False, arc_seen=False, arc_waited_s=0.0, stitched_to=to)
 
 
 def with_arc(state: WeldingState, sample: ServoSample) -> WeldingState:
@@ -126,6 +141,9 @@ def welding_step(
         return _answer(state, V, config, Diagnostics()) if problem is None else _rest(fault(state, problem), config)
     if state.phase in _MOVING and state.stand:
         state, V, over = stand_step(with_arc(state, sample), sample, config, dt)
+        if over and config.stitch.on_m:
+            state = changed(stitched(state, config), stand=Stand.NONE)
+            over = state.stitched_to >= state.s_end
         return _rest(_done(state), config) if over else _answer(state, V, config, Diagnostics())
     if state.phase in _MOVING:
         return _weld(with_arc(state, sample), sample, config, dt)
@@ -294,17 +312,18 @@ def _weld(
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(fault(state, text), config)
     # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
-    start, torch = start_arc(state, curve), config.torch
-    on_the_way = way_to_rest_m(motion.v_torch, config)
-    there = target.s >= start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
-    burning = (state.torch_on or there) and target.s < state.s_end
-    if burning and not state.torch_on and torch.from_rest:
-        return _stand(state, motion.V_BT, Stand.START, config)
-    if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= state.s_end - on_the_way:
-        return _stand(state, motion.V_BT, Stand.CRATER, config)
-    lit_at = sample.time if burning and not state.torch_on else state.lit_at
-    state = changed(state, torch_on=burning, lit_at=lit_at)
-    problem = unlit(state, target.s, target.s - start, error, config)
+    piece, torch, on_the_way = current_piece(state, config), config.torch, way_to_rest_m(motion.v_torch, config)
+    if piece is not None:
+        there = target.s >= piece.start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
+        burning = (state.torch_on or there) and target.s < piece.end
+        if burning and not state.torch_on and torch.from_rest:
+            return _stand(state, motion.V_BT, Stand.START, config)
+        if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= piece.end - on_the_way:
+            return _stand(state, motion.V_BT, Stand.CRATER, config)
+        lit_at = sample.time if burning and not state.torch_on else state.lit_at
+        over = config.stitch.on_m > 0.0 and state.torch_on and not burning
+        state = stitched(state, config) if over else changed(state, torch_on=burning, lit_at=lit_at)
+        problem = None if over else unlit(state, target.s, target.s - piece.start, error, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
     if target.s >= state.s_end:

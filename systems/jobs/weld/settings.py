@@ -39,6 +39,7 @@ from weldcal.welding.servo.settings import (
     TorchControl,
     TouchOnConfig,
 )
+from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.tool_axes import tool_path
 from weldcal.welding.servo.weave import WEAVE_SHARE, Bound, WeaveConfig, check_weave
 
@@ -145,6 +146,7 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        stitch=StitchConfig() if welding.stitch is None else welding.stitch.stitch(),
         windows=SeamWindows.of(tool),
         felt=felt,
         torch=TorchControl(

@@ -64,6 +64,14 @@ def test_measured_values_count_more_than_set_ones() -> None:
     assert (heat.least, heat.mean, heat.most) == pytest.approx((0.2, 0.5333, 1.2), rel=0.01)
 
 
+def test_the_record_states_where_the_arc_burned() -> None:
+    pause = log([0.010] * 351, s_torch_m=(1e-5 * 8 * np.arange(351)).tolist())
+    pause.columns["torch_on"][105:255] = 0.0  # 12 mm, from 8 mm on
+    found = only(pause)
+    assert np.array(found.arc_mm) == pytest.approx(np.array([[0.0, 8.0], [20.0, 28.0]]), abs=0.1)
+    assert found.welded_mm == pytest.approx(16.0, abs=0.2)
+
+
 def test_without_arc_values_no_heat_is_stated() -> None:
     found = only(log(TWO_SPEEDS, WeldProcess()))
     assert found.arc_values == "unknown"
