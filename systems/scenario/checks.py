@@ -43,7 +43,7 @@ POSITIVE = {
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
     *("repeatability_mm", "from_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
-    *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
+    *("interpass_s", "translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg", "margin_m"),
 }
 LENGTHS = {
@@ -272,6 +272,8 @@ def check_scenario(scenario: Scenario) -> None:
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
+    if scenario.welding.later_passes() and scenario.welding.pass_obstacles:
+        raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
     if scenario.welding.stitch is not None:
         scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()

@@ -15,9 +15,10 @@ from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
+from weldcal.welding.passes.felt import WeldPass
+from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
-from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
@@ -182,6 +183,29 @@ class StitchOrder:
         return StitchConfig(on_m=1e-3 * self.on_mm, off_m=1e-3 * self.off_mm, from_m=1e-3 * self.from_mm)
 
 
+@dc.dataclass(kw_only=True)
+class PassOrder:
+    """A pass: where its torch is beside the root's path, as the root pass has felt it."""
+
+    lateral_mm: float = 0.0  # to the left of the root's travel, square to the joint's bisector
+    vertical_mm: float = 0.0  # along the bisector, out of the joint
+    angle_deg: float = 0.0  # lean of the tool across the seam, the left side up
+    speed_mm_s: float | None = None  # null: welding.speed_mm_s
+    reverse: bool = False  # weld it from the seam's end to its start
+    interpass_s: float = 0.0  # least time since the arc of the pass before went out
+
+    def weld_pass(self) -> WeldPass:
+        """The order as a WeldPass."""
+        return WeldPass(
+            lateral_m=1e-3 * self.lateral_mm,
+            vertical_m=1e-3 * self.vertical_mm,
+            angle_rad=math.radians(self.angle_deg),
+            speed_m_s=None if self.speed_mm_s is None else 1e-3 * self.speed_mm_s,
+            reverse=self.reverse,
+            interpass_s=self.interpass_s,
+        )
+
+
 @dc.dataclass
 class ArcConfig:
     """How the arc starts and ends."""
@@ -240,6 +264,7 @@ class WeldingConfig:
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
     stitch: StitchOrder | None = None  # null: the arc burns along the whole seam
+    passes: list[PassOrder] = dc.field(default_factory=list)  # after the root pass, in the order of welding
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
@@ -250,6 +275,10 @@ class WeldingConfig:
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
+
+    def later_passes(self) -> tuple[WeldPass, ...]:
+        """The passes after the root."""
+        return tuple(order.weld_pass() for order in self.passes)
 
 
 @dc.dataclass(kw_only=True)

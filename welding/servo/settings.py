@@ -11,10 +11,10 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
+from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.seam.plan_fit import PlanFitConfig
 from weldcal.welding.seam.refinement import RefinementConfig
-from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.weave import Bound, WeaveConfig, check_weave, tool_bounds
 
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from weldcal.welding.numerics import Array, changed, clip, dot, finite
+from weldcal.welding.passes.stitch import Piece
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
@@ -25,7 +26,6 @@ from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, fee
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
-from weldcal.welding.servo.stitch import Piece
 from weldcal.welding.servo.touch import check_length, touch_step
 from weldcal.welding.servo.track import torch_target, weaving
 

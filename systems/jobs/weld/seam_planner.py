@@ -22,13 +22,16 @@ from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.locate.part.joint import check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
-from weldcal.welding.seam.clearance import NoClearance, check_beside, check_ends, clear_pieces
+from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
+from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -100,6 +103,7 @@ class SeamPlanning(Welder):
     piece: int = 0  # of an interrupted seam
     number: int = 0  # of the seam
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
+    passes: tuple[WeldPass, ...] = ()  # after the root
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -140,6 +144,29 @@ class SeamPlanning(Welder):
         check_travel(seam, self.config)
         return find_way(self, seam, X_BP, leans)
 
+    def pass_way(self, felt: SeamCurve, number: int, X_BP: RigidTransform | None) -> tuple[SeamCurve, ArmWay]:
+        """Plan a pass after the root by its number, from 1, beside the felt line of the tip.
+
+        Raises:
+            InfeasiblePath: the arm cannot follow.
+            WeldcalError: as `way`.
+        """
+        tool, order = self.tool, self.passes[number - 1]
+        config, ahead_m = pass_config(self.config, order, tool.tip_radius_m), TIP_AHEAD * tool.chord_m
+        seam = pass_line(felt, order, self.config, tool.tip_radius_m, ahead_m, OVERLAP_M)
+        check_length(seam, config)
+        try:
+            if X_BP is not None:
+                fits = (tool.capsules(), tool.X_FT, tool.chord_m, order.lean_rad)
+                check_clearance(self.workpiece.mesh, X_BP, seam, *fits)
+                check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
+            check_feasible(seam, tool.chord_m, config.weld_speed_m_s, config.windows)
+            check_travel(seam, config)
+            way = find_way(dc.replace(self, config=config, advises=False), seam, X_BP, [order.lean_rad])
+        except WeldcalError as problem:
+            raise PassError(f"welding.passes[{number}]: {problem}") from problem
+        return seam, way
+
 
 class SeamPlanner(BackgroundSystem):
     """Plans the seam from the workpiece's scan, with its CAD or from the cloud only, and maps it to the base by X_BC.
@@ -151,6 +178,7 @@ class SeamPlanner(BackgroundSystem):
         - scan
         - job
         - calibration_status
+        - servo_report
         - history
         output_ports:
         - planned_seam
@@ -173,12 +201,17 @@ class SeamPlanner(BackgroundSystem):
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._report = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
 
     def ask(self, context: Context, newest: PlannedSeam) -> Answer[PlannedSeam] | None:
         """Ask for the plan from a new scan of the workpiece."""
         scan: Scan = self._scan.Eval(context)
         job: JobCommand = self._job.Eval(context)
+        if job.weld_pass > newest.weld_pass and newest.reason is None:
+            planning = dc.replace(self._planning, workpiece=numbered(self._planning.workpiece, job.seam))
+            report: ServoReport = self._report.Eval(context)
+            return self.background.ask(plan_pass, planning, newest, job.weld_pass, report.state)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
             return None
         X_BC, correction, planning = self._X_BC_known, ScannerCorrection(), self._planning
@@ -214,6 +247,29 @@ class SeamPlanner(BackgroundSystem):
 
 def _kept(plan: PlannedSeam) -> PlannedSeam:
     return plan
+
+
+def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: WeldingState | None) -> PlannedSeam:
+    """Plan the pass of this number after the root, or after the pass before it, from what the tip felt in the root."""
+    felt = root.felt_line
+    if felt is None:
+        assert state is not None
+        felt = felt_line(state, TIP_AHEAD * planning.tool.chord_m)
+    record = SeamRecord(root.records[-1].seam if root.records else 0, weld_pass=number)
+    plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
+    try:
+        seam, way = planning.pass_way(felt, number, root.X_BP)
+    except WeldcalError as error:
+        return dc.replace(plan, seam=None, reason=str(error))
+    return dc.replace(
+        plan,
+        seam=seam,
+        q_start=way.q_start,
+        q_above=way.q_above,
+        q_retract=way.q_retract,
+        lean_rad=way.lean_rad,
+        touch_arc_m=None,
+    )
 
 
 def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, correction: ScannerCorrection) -> Array:
@@ -369,6 +425,8 @@ def unfelt_sigma(planning: SeamPlanning, found: RootPlan, at: npt.NDArray[np.int
 def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
     """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
     way = planning.way(seam, X_BP)
+    for number in range(1, len(planning.passes) + 1):  # before the root is welded
+        planning.pass_way(seam, number, X_BP)
     felt = is_felt(planning.workpiece, planning.tool)
     share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
@@ -434,6 +492,7 @@ class DrawnSeamPlanner(SeamPlanner):
         - scan
         - job
         - calibration_status
+        - servo_report
         - history
         output_ports:
         - planned_seam

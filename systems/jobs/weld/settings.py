@@ -27,6 +27,7 @@ from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TI
 from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
@@ -39,7 +40,6 @@ from weldcal.welding.servo.settings import (
     TorchControl,
     TouchOnConfig,
 )
-from weldcal.welding.servo.stitch import StitchConfig
 from weldcal.welding.servo.tool_axes import tool_path
 from weldcal.welding.servo.weave import WEAVE_SHARE, Bound, WeaveConfig, check_weave
 
@@ -303,6 +303,7 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
     seams = max(1, listed if cad is None else seam_count(cad))
     pieces = 2 if scenario.welding.pass_obstacles else 1
+    interpass_s = tuple(order.interpass_s for order in scenario.welding.later_passes())
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
@@ -315,8 +316,9 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         minimum_scans=c.minimum_scans,
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
-        maximum_time_s=job.maximum_time_s * slower * seams * pieces,
+        maximum_time_s=(job.maximum_time_s * slower * pieces * (1 + len(interpass_s)) + sum(interpass_s)) * seams,
         seams=seams,
+        interpass_s=interpass_s,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )
 

@@ -10,10 +10,10 @@ import pytest
 from weldcal.tools.worlds.weld.budgets import NOMINAL
 from weldcal.tools.worlds.weld.plant import StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, s_curve
+from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.process import PathError, path_error
 from weldcal.welding.servo.settings import ServoConfig, TorchControl
 from weldcal.welding.servo.state import Phase
-from weldcal.welding.servo.stitch import StitchConfig, StitchError
 
 UP = np.array([0.0, 0.0, 1.0])
 STITCH = StitchConfig(on_m=0.030, off_m=0.045, from_m=0.015)  # on 300 mm: the last one is left out
