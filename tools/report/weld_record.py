@@ -1,6 +1,5 @@
 """Write the record of a welded part: record.json, record.csv, pictures of each seam, and the report's section."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -62,7 +61,7 @@ class PartRecord:
     def outside(self) -> list[str]:
         """A sentence for each limit that a seam exceeds."""
         return [
-            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {_name(seam)}: {_WORDS[name][0]} is {_range(seam, name)}, and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -80,7 +79,7 @@ class PartRecord:
                 limit = _limit(self.order, name)
                 verdict = "" if limit == "–" else "outside" if name in outside else "within"
                 mean = fixed(_spread(seam, name).mean, digits)
-                found.append((str(seam.seam), f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+                found.append((_name(seam), f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -181,8 +180,8 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
 
 def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
     """The record of a finished run from its weld log; without a seam where no arc burned."""
-    numbers: Sequence[int] = [plan.seam for plan in run.cell.job.planned_seam(run.root).records]
-    seams = [welded_seam(log, number, rows) for number, rows in seam_rows(log, numbers)]
+    plans = [(plan.seam, plan.weld_pass) for plan in run.cell.job.planned_seam(run.root).records]
+    seams = [welded_seam(log, numbers, rows) for numbers, rows in seam_rows(log, plans)]
     pictures = {
         f"seam_{seam + 1}_{end}": cv2.imencode(".png", image.pixels)[1].tobytes()
         for seam, images in run.seam_pictures.items()
@@ -195,6 +194,10 @@ def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
         seams=tuple(seam for seam in seams if seam is not None),
         pictures=pictures,
     )
+
+
+def _name(seam: WeldedSeam) -> str:
+    return str(seam.seam) if seam.weld_pass == 1 else f"{seam.seam}, pass {seam.weld_pass}"
 
 
 def _spread(seam: WeldedSeam, name: str) -> Spread:

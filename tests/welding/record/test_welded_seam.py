@@ -35,7 +35,7 @@ def log(speeds: list[float], process: WeldProcess = MAG, **columns: list[float])
 
 
 def only(record: WeldRecord) -> WeldedSeam:
-    (found,) = (welded_seam(record, number, rows) for number, rows in seam_rows(record, [0]))
+    (found,) = (welded_seam(record, number, rows) for number, rows in seam_rows(record, [(0, 0)]))
     assert found is not None
     return found
 
@@ -94,18 +94,18 @@ def test_a_hold_is_no_time_of_welding() -> None:
     assert only(record).arc_s == pytest.approx(2.0, rel=0.01)
 
 
-def test_pieces_of_a_seam_share_a_row() -> None:
+def test_pieces_of_a_pass_share_a_row() -> None:
     one = log([0.010] * 251)
-    table = {name: np.concatenate([one[name]] * 3) for name in one.columns}
+    table = {name: np.concatenate([one[name]] * 4) for name in one.columns}
     table["time_s"] = TICK_S * np.arange(len(table["time_s"]))
-    record = WeldRecord(table, np.concatenate([one.phase] * 3), MAG)
-    found = {number: rows.sum() for number, rows in seam_rows(record, [0, 0, 4])}
-    assert found == {0: 2 * len(one), 4: len(one)}
+    record = WeldRecord(table, np.concatenate([one.phase] * 4), MAG)
+    found = {number: rows.sum() for number, rows in seam_rows(record, [(0, 0), (0, 0), (0, 1), (4, 0)])}
+    assert found == {(0, 0): 2 * len(one), (0, 1): len(one), (4, 0): len(one)}
 
 
 def test_an_arc_that_never_burned_has_no_row() -> None:
     record = log([0.010] * 20, arc=[0.0] * 20)
-    assert welded_seam(record, 0, np.ones(len(record), dtype=bool)) is None
+    assert welded_seam(record, (0, 0), np.ones(len(record), dtype=bool)) is None
 
 
 @pytest.mark.parametrize(
