@@ -69,8 +69,9 @@ def felt_line(state: WeldingState, ahead_m: float) -> SeamCurve:
     if len(points) > _LEAST_POINTS:
         at = np.empty(len(points))
         at[0] = float(curve.project(points[0], float(state.refined.arc[0]), 0.02))
+        way = np.linalg.norm(np.diff(points, axis=0), axis=1)  # long where the tip was lifted over a tack
         for i in range(1, len(at)):
-            at[i] = curve.nearest(points[i], at[i - 1])
+            at[i] = curve.nearest(points[i], at[i - 1] + way[i - 1])
         gap = points - curve.position(at)
         off = np.column_stack([np.sum(gap * curve.normal(at), axis=1), np.sum(gap * curve.up(at), axis=1)])
         left, above = _smoothed(s, at, off).T
@@ -115,8 +116,9 @@ def pass_line(
 
 
 def lift_m(root: ServoConfig, ball_m: float) -> float:
-    """How much higher than in the root the tip hangs above its torch's path, m: clear of the weld below that."""
-    return max(0.0, ball_m + CLEAR_M - (TORCH_ABOVE_ROOT_M - root.clearance_m))
+    """How much higher than in the root the tip hangs above its torch's path, m: clear of weld and tacks below that."""
+    over_tacks = max((tack.lift + CLEAR_M for tack in root.tacks), default=0.0)
+    return max(over_tacks, ball_m + CLEAR_M - (TORCH_ABOVE_ROOT_M - root.clearance_m))
 
 
 def pass_config(root: ServoConfig, order: WeldPass, ball_m: float) -> ServoConfig:
@@ -125,6 +127,7 @@ def pass_config(root: ServoConfig, order: WeldPass, ball_m: float) -> ServoConfi
     return replace(
         root,
         felt=False,
+        tacks=(),
         tool=tool,
         touch=replace(root.touch, offset_m=0.0),
         deflection=replace(root.deflection, delta_d_m=_OFF_M, axial_d_m=_OFF_M),

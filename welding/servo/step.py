@@ -7,6 +7,7 @@ import numpy as np
 
 from weldcal.welding.numerics import Array, changed, clip, dot, finite
 from weldcal.welding.passes.stitch import Piece
+from weldcal.welding.passes.tacks import LIFT_M_S, SLEW_M_S2
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
@@ -94,6 +95,7 @@ def wait_for_arc(
     return state, share * V_stop, reason
 
 
+_IN_JOINT_M = 1.0e-3  # a choice: half of the lowest tack
 _THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 
@@ -213,6 +215,8 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
+        if law.guarded and (hop := config.hop_at(state.s_tip)) is not None and state.s_tip < hop.up:
+            return _coasting(drop(state), hop.down)
         if not law.guarded:
             # The paper appends every point and does not detect contact; the wanted deflection without contact is an
             # interpretation.
@@ -223,7 +227,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             )
         if not lost:
             return with_point(raised(state, config), config)
-        state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
+        state = drop(state)
         if state.s_tip > state.s_end - end_window:
             assert before.measurement is not None
             assert state.plan_fit is not None
@@ -232,23 +236,41 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             if goes_on(state, config):
                 high = state.s_end
             return changed(finish(state), s_end=clip(last, low, high))
-        return changed(
-            state,
-            phase=Phase.COAST,
-            lost_at=state.s_tip,
-            lost_time=state.frame_time,
-            residual_at_loss=_tip_residual(state),
-        )
+        return _coasting(state, state.s_tip)
     if state.phase == Phase.COAST:
         # Just after the loss the springs are still relaxing: that is not a new contact.
         waited = state.frame_time - state.lost_time > limits.regain_after_s
         settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
-        touching = settled and state.delta_axial > limits.regain_axial_m
+        touching = settled and state.delta_axial > limits.regain_axial_m and _as_low_as_before(state, config)
         regained = state.regained + 1 if touching else 0
         if regained >= limits.regain_frames:
             return changed(state, phase=Phase.TRACK, regained=0, proven=False)
         return changed(state, regained=regained)
     return state
+
+
+def drop(state: WeldingState) -> WeldingState:
+    """Return the state of a tip whose last points do not count."""
+    return changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
+
+
+def _coasting(state: WeldingState, lost_at: float) -> WeldingState:
+    """Return the state that coasts on the moved plan and what it was off; contact counts again from `lost_at` m."""
+    residual = _tip_residual(state)
+    return changed(
+        state, phase=Phase.COAST, lost_at=lost_at, lost_time=state.frame_time, residual_at_loss=residual
+    )
+
+
+def _as_low_as_before(state: WeldingState, config: ServoConfig) -> bool:
+    """Whether a tip that comes down after a tack is in the joint, not on the tack."""
+    if config.hop_at(state.s_tip) is None:
+        return True
+    assert state.measurement is not None
+    assert state.plan_fit is not None
+    point = state.measurement.point
+    _, above = mean_residual(point[None], state.plan_fit.curve, state.s_tip)
+    return bool(above - state.residual_at_loss[1] < _IN_JOINT_M)
 
 
 def _tip_residual(state: WeldingState) -> Array:
@@ -366,18 +388,23 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
-    wanted = state.residual_at_loss + np.array((0.0, -config.gap.hover_m)) if state.phase == Phase.COAST else state.hold
+    wanted, rise = state.hold, 0.0
+    if state.phase == Phase.COAST:
+        height, hop = -config.gap.hover_m, config.hop_at(state.s_tip)
+        if hop is not None:
+            height, slope = hop.place(state.s_tip, -deflection.axial_d_m, height)
+            rise = slope * state.v_tip
+        wanted = state.residual_at_loss + np.array((0.0, height))
     gap = wanted - off
-    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1])
+    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1]) + rise
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
     """The state with the servo speeds limited in speed and slew."""
     deflection = config.deflection
-    top, step = (
-        max(deflection.speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
-        deflection.slew_m_s2 * dt,
-    )
+    hops = state.phase == Phase.COAST and config.hop_at(state.s_tip) is not None
+    faster = LIFT_M_S if hops else config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0
+    top, step = max(deflection.speed_m_s, faster), (SLEW_M_S2 if hops else deflection.slew_m_s2) * dt
     u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
     u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
     return changed(state, u_n=u_n, u_a=u_a)
