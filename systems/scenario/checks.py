@@ -34,6 +34,7 @@ POSITIVE = {
         "hole_from_mm",
         "bend_radius_mm",
         "on_mm",
+        "height_mm",
         "off_mm",
     ),
     *("maximum_time_s", "control_period_s", "following_error_rad"),
@@ -240,6 +241,25 @@ def check_refinement(scenario: Scenario) -> None:
         )
 
 
+def check_tack_order(scenario: Scenario) -> None:
+    """Check the tacks against the seams.
+
+    Raises:
+        InputError: a tack without a length or a seam, or tacks where the seam is interrupted.
+    """
+    welding, spec = scenario.welding, scenario.workpiece
+    seams = 1 if spec is None else max(1, len(spec.seams))
+    for k, tack in enumerate(welding.tacks):
+        if not tack.from_mm < tack.to_mm:
+            raise InputError(
+                f"welding.tacks[{k}].to_mm is {tack.to_mm:g}, and from_mm {tack.from_mm:g}: it must be larger."
+            )
+        if not 1 <= tack.seam <= seams:
+            raise InputError(f"welding.tacks[{k}].seam is {tack.seam}, and the part has seams 1 to {seams}.")
+    if welding.tacks and (welding.pass_obstacles or welding.law != "guarded"):
+        raise InputError("welding.tacks goes with welding.law: guarded and without welding.pass_obstacles.")
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -274,6 +294,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
     if scenario.welding.later_passes() and scenario.welding.pass_obstacles:
         raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
+    check_tack_order(scenario)
     if scenario.welding.stitch is not None:
         scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()

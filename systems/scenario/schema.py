@@ -206,6 +206,16 @@ class PassOrder:
         )
 
 
+@dc.dataclass(kw_only=True)
+class TackOrder:
+    """A tack in the joint, over which the tip is lifted."""
+
+    from_mm: float = 0.0  # along the seam
+    to_mm: float = 0.0
+    height_mm: float = 4.0  # of its top over the root
+    seam: int = 1  # number of the seam, from 1
+
+
 @dc.dataclass
 class ArcConfig:
     """How the arc starts and ends."""
@@ -264,6 +274,7 @@ class WeldingConfig:
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
     stitch: StitchOrder | None = None  # null: the arc burns along the whole seam
+    tacks: list[TackOrder] = dc.field(default_factory=list)  # a simulated part has them
     passes: list[PassOrder] = dc.field(default_factory=list)  # after the root pass, in the order of welding
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
@@ -275,6 +286,10 @@ class WeldingConfig:
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
+
+    def tacks_m(self) -> list[tuple[int, float, float, float]]:
+        """The tacks: number of the seam, from 0, start and end along it, and height over its root, m."""
+        return [(t.seam - 1, 1e-3 * t.from_mm, 1e-3 * t.to_mm, 1e-3 * t.height_mm) for t in self.tacks]
 
     def later_passes(self) -> tuple[WeldPass, ...]:
         """The passes after the root."""

@@ -257,9 +257,7 @@ def drop(state: WeldingState) -> WeldingState:
 def _coasting(state: WeldingState, lost_at: float) -> WeldingState:
     """Return the state that coasts on the moved plan and what it was off; contact counts again from `lost_at` m."""
     residual = _tip_residual(state)
-    return changed(
-        state, phase=Phase.COAST, lost_at=lost_at, lost_time=state.frame_time, residual_at_loss=residual
-    )
+    return changed(state, phase=Phase.COAST, lost_at=lost_at, lost_time=state.frame_time, residual_at_loss=residual)
 
 
 def _as_low_as_before(state: WeldingState, config: ServoConfig) -> bool:

@@ -1,6 +1,6 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -363,10 +363,11 @@ def _add_welding(
             "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write"
             " workpiece.located_by: scan."
         )
+    more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
     planner = wiring.add(
         "seam_planner",
         kind(
-            seam_planning(scenario, station, config),
+            replace(seam_planning(scenario, station, config), configs=(config, *more)),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,
             X_FC_known=None if carried is None else carried.pose(),
@@ -379,7 +380,6 @@ def _add_welding(
     )
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
-    more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
     servo = wiring.add(
         "welding_servo", WeldingVelocityServo(station.arm, tool, config, more, scenario.welding.later_passes())
     )

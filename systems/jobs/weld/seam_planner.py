@@ -3,13 +3,14 @@
 import dataclasses as dc
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
+from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, expected_factors
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
@@ -31,6 +32,7 @@ from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_con
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
+from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
@@ -71,6 +73,7 @@ def plan_root_anyhow(
 
 
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
+TACK_BESIDE_M = 3e-3  # a choice: about a tack, above what a scan and a list are off along the seam
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
@@ -104,12 +107,26 @@ class SeamPlanning(Welder):
     number: int = 0  # of the seam
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
     passes: tuple[WeldPass, ...] = ()  # after the root
+    configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
         if self.method.method == "cloud":
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
+
+    def of_seam(self, number: int) -> Self:
+        """Return what the seam of this number is planned from."""
+        config = self.configs[number] if number < len(self.configs) else self.config
+        return dc.replace(self, workpiece=numbered(self.workpiece, number), number=number, config=config)
+
+    def without_tacks(self, points_B: Array, seam: SeamCurve) -> Array:
+        """The points (n, 3) m of a scan that are not of the ordered tacks; the seam is the tip's line."""
+        for tack in self.config.tacks:
+            s = np.arange(tack.start - TACK_BESIDE_M, tack.end + TACK_BESIDE_M, 1e-3)
+            reach = self.tool.tip_radius_m + tack.lift + TACK_BESIDE_M
+            points_B = points_B[np.asarray(cKDTree(seam.position(s)).query(points_B)[0]) > reach]
+        return points_B
 
     def field_at(self, points_B: Array) -> Array:
         """The local field (n, 3) m at points (n, 3) m of the part, for the flange's orientation in the drawn weld.
@@ -209,7 +226,7 @@ class SeamPlanner(BackgroundSystem):
         scan: Scan = self._scan.Eval(context)
         job: JobCommand = self._job.Eval(context)
         if job.weld_pass > newest.weld_pass and newest.reason is None:
-            planning = dc.replace(self._planning, workpiece=numbered(self._planning.workpiece, job.seam))
+            planning = self._planning.of_seam(job.seam)
             report: ServoReport = self._report.Eval(context)
             return self.background.ask(plan_pass, planning, newest, job.weld_pass, report.state)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
@@ -228,13 +245,7 @@ class SeamPlanner(BackgroundSystem):
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
-        planning = dc.replace(
-            planning,
-            workpiece=numbered(planning.workpiece, job.seam),
-            number=job.seam,
-            piece=job.piece,
-            earlier=newest.records,
-        )
+        planning = dc.replace(planning.of_seam(job.seam), piece=job.piece, earlier=newest.records)
         views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
         if job.view + 1 < job.views and X_BC is not None:
             return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views, records=newest.records))
@@ -312,7 +323,7 @@ def plan_seam(
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            beside = (points_B, planning.workpiece.mesh, found.X_BP)
+            beside = (planning.without_tacks(points_B, seam), planning.workpiece.mesh, found.X_BP)
             if planning.pass_obstacles:
                 stops: list[float] = []
                 check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)

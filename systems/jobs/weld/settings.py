@@ -28,6 +28,7 @@ from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
+from weldcal.welding.passes.tacks import Tack
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
@@ -132,6 +133,11 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
     felt = is_felt(cad, tool)
     if not felt:
         press = Press(_UNPRESSED_M, _UNPRESSED_M)
+    tacks = tuple(
+        Tack(a, b, lift)
+        for k, a, b, height in welding.tacks_m()
+        if k == seam and (lift := height + tool.tip_radius_m - seat.above_m) > 0.0
+    )
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -146,6 +152,7 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        tacks=tacks,
         stitch=StitchConfig() if welding.stitch is None else welding.stitch.stitch(),
         windows=SeamWindows.of(tool),
         felt=felt,

@@ -132,7 +132,8 @@ class TipPlace:
             gn = g0 * n0 + g1 * n1 + g2 * n2 - self.y
             gb = g0 * u0 + g1 * u1 + g2 * u2 - self.z
             low, slope = groove.floor(self.s, self.y)
-            if not groove.present(self.s) or (self.z > low + 1e-9 and self.z + _SHARE * gb > low):
+            lifted = gb > 0.0 or self.z > low + 1e-9
+            if not groove.present(self.s) or (lifted and self.z + _SHARE * gb > low):
                 self.touching = False
                 self.s, self.y, self.z = self.s + _SHARE * gt, self.y + _SHARE * gn, self.z + _SHARE * gb
                 if groove.present(self.s):
