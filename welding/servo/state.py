@@ -160,6 +160,7 @@ class WeldingState:
     axial_paused: bool = False
     regained: int = 0
     proven: bool = False
+    settling: bool = False
     progress: float = 0.0
     furthest: float = -math.inf
     progress_log: tuple[tuple[float, float], ...] = ()

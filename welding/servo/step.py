@@ -216,7 +216,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
         if law.guarded and (hop := config.hop_at(state.s_tip)) is not None and state.s_tip < hop.up:
-            return _coasting(drop(state), hop.down)
+            return changed(_coasting(drop(state), hop.down), settling=True)
         if not law.guarded:
             # The paper appends every point and does not detect contact; the wanted deflection without contact is an
             # interpretation.
