@@ -39,8 +39,10 @@ def scenario_of(name: str, folder: Path, tacks: bool) -> Scenario:
     trial = PartTrial()
     if CELLS[name]:
         scenario = trial.scenario(write_cell(PARTS[CELLS[name]](), folder, trial))
+    elif tacks:
+        scenario = known_camera("s_groove")
     else:
-        scenario = known_camera("s_groove") if tacks else load_scenario("s_groove")
+        scenario = load_scenario("s_groove")
     scenario.welding.speed_mm_s = 16.0
     scenario.job.maximum_time_s = 600.0
     if tacks:
@@ -62,7 +64,7 @@ def over_tacks(name: str, result: DemoResult) -> list[float]:
     found = []
     for a, b in zip(TACKS[name][::2], TACKS[name][1::2], strict=True):
         off = None if result.weld is None else result.weld.error
-        near = [] if off is None else off.distance_m[(off.s > 1e-3 * a - NEAR_M) & (off.s < 1e-3 * b + NEAR_M)]
+        near = np.empty(0) if off is None else off.distance_m[(off.s > 1e-3 * a - NEAR_M) & (off.s < 1e-3 * b + NEAR_M)]
         found.append(1e3 * float(np.max(near)) if len(near) else math.inf)
     return found
 
