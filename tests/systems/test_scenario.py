@@ -593,7 +593,7 @@ def test_a_file_named_in_a_base_is_looked_for_beside_the_base(tmp_path: Path) ->
     ("text", "named"),
     [
         ("extends: nowhere\n", "mine.yaml extends 'nowhere', which does not exist: choose one of"),
-        ("extends: mine.yaml\n", "mine.yaml extends itself by way of mine.yaml"),
+        ("extends: mine.yaml\n", "mine.yaml extends itself through mine.yaml"),
     ],
 )
 def test_a_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, named: str) -> None:

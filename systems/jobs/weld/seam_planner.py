@@ -370,9 +370,7 @@ def interrupted(
     chord = planning.tool.chord_m
     pieces = clear_pieces(seam, stops, chord, RUN_UP_S * planning.config.weld_speed_m_s)
     if planning.piece >= len(pieces):
-        raise NoClearance(
-            "Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0
-        )
+        raise NoClearance("The obstacles beside the seam leave nothing of it to weld: remove them and scan again.", 0.0)
     start, end, down = pieces[planning.piece]
     ends = [0.0, *(s for a, b, _ in pieces for s in (a, b)), seam.length]
     left_out = tuple((a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1e-6)

@@ -292,7 +292,7 @@ def check_scan_moves(scenario: Scenario, station: Station) -> None:
                 else "home from the last of planning.scan_poses_deg"
             )
             raise InputError(
-                f"On the way {where} the arm would touch the table, the part, the surroundings or itself: choose"
+                f"On its move {where} the arm would touch the table, the part, the surroundings or itself: choose"
                 " another pose."
             )
 
