@@ -43,7 +43,7 @@ def scenario_of(name: str, folder: Path, tacks: bool) -> Scenario:
         scenario = known_camera("s_groove")
     else:
         scenario = load_scenario("s_groove")
-    scenario.welding.speed_mm_s = 16.0
+    scenario.welding.speed_mm_s = 8.0 if tacks else 16.0
     scenario.job.maximum_time_s = 600.0
     if tacks:
         ends = zip(TACKS[name][::2], TACKS[name][1::2], HEIGHTS_MM[name], strict=True)

@@ -95,6 +95,7 @@ def wait_for_arc(
     return state, share * V_stop, reason
 
 
+_DOWN_SHARE = 0.5  # a choice: of the wanted deflection, at which the ball is firmly in its joint
 _IN_JOINT_M = 1.0e-3  # a choice: half of the lowest tack
 _THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
@@ -388,7 +389,9 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
     wanted, rise = state.hold, 0.0
     if state.phase == Phase.COAST:
-        height, hop = -config.gap.hover_m, config.hop_at(state.s_tip)
+        # after a tack the plan may have come off by more than over a gap: the tip comes down deeper
+        height = -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m
+        hop = config.hop_at(state.s_tip)
         if hop is not None:
             height, slope = hop.place(state.s_tip, -deflection.axial_d_m, height)
             rise = slope * state.v_tip
