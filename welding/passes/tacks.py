@@ -10,6 +10,8 @@ CLEAR_M = 1e-3  # a choice: between the ball and a tack's top, above the error o
 BESIDE_M = 3e-3  # a choice: before and after a tack, above what a plan is off along its seam
 LIFT_M_S = 15e-3  # a choice: largest speed up and down; with a chord of 60 mm the tool pitches by 14 deg/s
 SLEW_M_S2 = 0.1  # a choice: 9 mm in 0.9 s need 0.07
+SETTLING_S = 0.6  # a choice: until the ball is pressed in again, as it takes in simulation
+FELT_AFTER_M = 10e-3  # a choice: of points beyond the gap, which give the path its direction there
 _PEAK = 1.5  # largest over mean slope of a cubic step
 HIGHEST_M = 8e-3  # a choice: the tool pitches by it; a higher one is a bead of its own
 
@@ -66,8 +68,10 @@ def hops(tacks: tuple[Tack, ...], speed_m_s: float, pressed_m: float) -> tuple[H
     return tuple(found)
 
 
-def check_tacks(tacks: tuple[Tack, ...], found: tuple[Hop, ...], touch_m: float) -> None:
-    """Check tacks, and that the tip has felt the seam before it leaves it.
+def check_tacks(
+    tacks: tuple[Tack, ...], found: tuple[Hop, ...], touch_m: float, chord_m: float, speed_m_s: float
+) -> None:
+    """Check tacks: the tip feels the seam before it leaves it, and again before the torch is there.
 
     Raises:
         TackError: it names the tack.
@@ -79,6 +83,13 @@ def check_tacks(tacks: tuple[Tack, ...], found: tuple[Hop, ...], touch_m: float)
             raise TackError(
                 f"The tack at {1e3 * tack.start:g} mm would lift the tip by {1e3 * tack.lift:.1f} mm, and it can be"
                 f" lifted by {1e3 * HIGHEST_M:g} mm: grind it."
+            )
+    for hop in found:
+        unfelt_m = hop.end - hop.begin + SETTLING_S * speed_m_s + FELT_AFTER_M
+        if unfelt_m > chord_m:
+            raise TackError(
+                f"About the tack at {1e3 * (hop.up + BESIDE_M):g} mm the tip feels nothing for"
+                f" {1e3 * unfelt_m:.0f} mm, and the torch is {1e3 * chord_m:.0f} mm behind it: weld slower, or grind it."
             )
     if found and found[0].begin < touch_m:
         short = touch_m - found[0].begin

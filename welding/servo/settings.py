@@ -362,7 +362,7 @@ class ServoConfig:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
         self.stitch.check(self.weld_speed_m_s)
         if self.tacks and self.felt:
-            check_tacks(self.tacks, self.hops, self.touch.arc_m)
+            check_tacks(self.tacks, self.hops, self.touch.arc_m, self.tool.torch_offset_m, self.weld_speed_m_s)
         if self.weave.amplitude_m:
             check_weave(self.weave, self.weave_bounds(self.weave))
 

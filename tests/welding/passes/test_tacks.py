@@ -26,7 +26,7 @@ MM = 1e-3
 
 def welded(seed: int, known: bool = True) -> tuple[StudyRun, PathError, np.ndarray]:
     """A run over three tacks, where the true torch was, and when it was on."""
-    config = ServoConfig(tacks=tuple(Tack(*t) for t in TACKS) if known else (), weld_speed_m_s=0.012)
+    config = ServoConfig(tacks=tuple(Tack(*t) for t in TACKS) if known else (), weld_speed_m_s=0.008)
     run = simulate(TrueSeam("s", s_curve(), np.array([0.0, 0.0, 1.0])), DRAWN, config, seed, tacks=TACKS)
     return run, path_error(run.points("torch"), run.torch_line), run.column("torch_on") > 0.5
 
@@ -75,6 +75,7 @@ def test_near_tacks_are_passed_in_one_lift() -> None:
         (Tack(0.010, 0.020, 3e-3), "tip comes down at 6 mm"),
         (Tack(0.100, 0.110, 9e-3), "grind it"),
         (Tack(0.110, 0.100, 3e-3), "end beyond the start"),
+        (Tack(0.100, 0.130, 5e-3), "100 mm the tip feels nothing for 65 mm, and the torch is 60 mm behind it"),
     ],
 )
 def test_a_tack_that_cannot_be_passed_is_refused(tack: Tack, said: str) -> None:
