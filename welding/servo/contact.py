@@ -151,13 +151,13 @@ def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -
 def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     """The state with its newest tactile point queued, the oldest committed, and the plan moved onto the points."""
     deflection = config.deflection
-    assert state.measurement is not None
-    assert state.plan_fit is not None
     if state.settling:  # after a tack: until it is pressed in again, the ball rests higher
         pressed = min(state.delta_n / deflection.delta_d_m, state.delta_axial / deflection.axial_d_m)
         if pressed < _PRESSED:
             return changed(state, refined=drop_pending(state.refined))
         state = changed(state, settling=False)
+    assert state.measurement is not None
+    assert state.plan_fit is not None
     proven = state.proven or state.delta_n > 0.5 * deflection.delta_d_m
     if not (proven or state.delta_axial > 0.33 * deflection.axial_d_m):
         return changed(state, refined=drop_pending(state.refined), proven=proven)
