@@ -28,7 +28,7 @@ job: {{calibrate: false, X_BC: {{xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0,
 welding: {{speed_mm_s: 12.0, seam_length_mm: 70.0, {more}}}
 """
 ORDER = (
-    "stitch: {on_mm: 40.0, off_mm: 10.0}, tacks: [{from_mm: 28, to_mm: 36, height_mm: 6.5}],"
+    "stitch: {on_mm: 30.0, off_mm: 10.0}, tacks: [{from_mm: 28, to_mm: 36, height_mm: 6.5}],"
     " passes: [{lateral_mm: 1.5, vertical_mm: 4.0, reverse: true}]"
 )
 
@@ -46,7 +46,7 @@ def test_a_root_and_a_cap_over_a_tack(tmp_path: Path) -> None:
         assert one["torch_max_mm"] < 0.3
     # the cap's pieces are counted from its own start, which is the seam's end
     for stretches in found["arc_mm"]:
-        assert np.array(stretches) == pytest.approx(np.array([[0.0, 40.0], [50.0, 70.0]]), abs=1.0)
+        assert np.array(stretches) == pytest.approx(np.array([[0.0, 30.0], [40.0, 70.0]]), abs=1.0)
     assert found["welded_mm"] == pytest.approx(120.0, abs=3.0)
     assert result.record is not None
     assert [(seam.seam, seam.weld_pass) for seam in result.record.seams] == [(1, 1), (1, 2)]

@@ -242,7 +242,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
         # Just after the loss the springs are still relaxing: that is not a new contact.
         waited = state.frame_time - state.lost_time > limits.regain_after_s
         settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
-        touching = settled and state.delta_axial > limits.regain_axial_m and _as_low_as_before(state, config)
+        touching = settled and state.delta_axial > limits.regain_axial_m and _as_low_as_before(state)
         regained = state.regained + 1 if touching else 0
         if regained >= limits.regain_frames:
             return changed(state, phase=Phase.TRACK, regained=0, proven=False)
@@ -261,9 +261,9 @@ def _coasting(state: WeldingState, lost_at: float) -> WeldingState:
     return changed(state, phase=Phase.COAST, lost_at=lost_at, lost_time=state.frame_time, residual_at_loss=residual)
 
 
-def _as_low_as_before(state: WeldingState, config: ServoConfig) -> bool:
-    """Whether a tip that comes down after a tack is in the joint, not on the tack."""
-    if config.hop_at(state.s_tip) is None:
+def _as_low_as_before(state: WeldingState) -> bool:
+    """Whether a tip that comes down after a tack is in the joint, not on the tack or on the face beside."""
+    if not state.settling:
         return True
     assert state.measurement is not None
     assert state.plan_fit is not None
