@@ -61,7 +61,8 @@ class PartRecord:
     def outside(self) -> list[str]:
         """A sentence for each limit that a seam exceeds."""
         return [
-            f"Seam {_name(seam)}: {_WORDS[name][0]} is {_range(seam, name)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {_name(seam)}: {_WORDS[name][0]} is {_range(seam, name)},"
+            f" and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]

@@ -1,7 +1,9 @@
 """Propose the passes that fill a joint of two flat walls, from the area that the wire lays down.
 
 A V groove and a fillet are the same wedge of half angle a about the bisector of their walls. An area A of metal with a
-level surface fills it up to h = sqrt(A / tan a). A layer that is wider than a bead may be is made of beads side by side.
+level surface fills it up to h = sqrt(A / tan a).
+
+A layer that is wider than a bead may be is made of beads side by side.
 """
 
 import math

@@ -89,7 +89,8 @@ def check_tacks(
         if unfelt_m > chord_m:
             raise TackError(
                 f"About the tack at {1e3 * (hop.up + BESIDE_M):g} mm the tip feels nothing for"
-                f" {1e3 * unfelt_m:.0f} mm, and the torch is {1e3 * chord_m:.0f} mm behind it: weld slower, or grind it."
+                f" {1e3 * unfelt_m:.0f} mm, and the torch is {1e3 * chord_m:.0f} mm behind it:"
+                " weld slower, or grind it."
             )
     if found and found[0].begin < touch_m:
         short = touch_m - found[0].begin

@@ -146,7 +146,8 @@ def simulate(
 
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
-            the tag is not seen; tacks: from, to and lift of the ball, m; carrier: what moves the tool from where it is; None: a robot that follows every
+            the tag is not seen; tacks: from, to and lift of the ball, m;
+            carrier: what moves the tool from where it is; None: a robot that follows every
             velocity.
 
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
