@@ -15,7 +15,7 @@ class StitchError(InputError):
     """Stitches that cannot be welded."""
 
 
-class Piece(NamedTuple):
+class Stitch(NamedTuple):
     """Where the arc starts and ends, m along the seam."""
 
     start: float
@@ -50,11 +50,11 @@ class StitchConfig:
                 f" {1e3 * speed_m_s:g} mm/s: raise on_mm and off_mm."
             )
 
-    def piece(self, s: float, start: float, end: float) -> Piece | None:
+    def piece(self, s: float, start: float, end: float) -> Stitch | None:
         """Return the first piece that ends beyond s m, on a seam from start to end m; None where there is none."""
         if self.on_m == 0.0:
-            return Piece(start, end)
+            return Stitch(start, end)
         first, pitch = start + self.from_m, self.on_m + self.off_m
         k = max(0, math.floor((s - first - self.on_m) / pitch + _ROUNDING) + 1)
         at = first + k * pitch
-        return None if at + _LEAST_SHARE * self.on_m > end else Piece(at, min(at + self.on_m, end))
+        return None if at + _LEAST_SHARE * self.on_m > end else Stitch(at, min(at + self.on_m, end))

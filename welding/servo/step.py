@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from weldcal.welding.numerics import Array, changed, clip, dot, finite
-from weldcal.welding.passes.stitch import Piece
+from weldcal.welding.passes.stitch import Stitch
 from weldcal.welding.passes.tacks import LIFT_M_S, SLEW_M_S2
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
@@ -39,7 +39,7 @@ def start_arc(state: WeldingState, curve: SeamCurve) -> float:
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
-def current_piece(state: WeldingState, config: ServoConfig) -> Piece | None:
+def current_piece(state: WeldingState, config: ServoConfig) -> Stitch | None:
     """Return the piece of the seam that is welded, or will be next; None after the last one."""
     assert state.plan_fit is not None
     start = start_arc(state, state.plan_fit.curve)
