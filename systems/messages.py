@@ -127,6 +127,7 @@ class JobCommand(Message):
     reason: str | None = None
     speed_share: float = 1.0  # of the mover's speed, 0 to 1
     seam: int = 0  # number of the seam that is planned and welded, from 0
+    weld_pass: int = 0  # number of its pass, 0: the root
     view: int = 0  # number of the newest scan of the workpiece, from 0
     views: int = 1  # number of scans that one plan is made from
     piece: int = 0  # number of its piece, where it is interrupted
@@ -235,6 +236,7 @@ class SeamRecord(Message):
     seam: int
     fit_up: FitUp | None = None
     left_out: tuple[tuple[float, float], ...] = ()
+    weld_pass: int = 0  # 0: the root
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -265,6 +267,8 @@ class PlannedSeam(Message):
     felt_before: NDArray[np.float64] | None = None  # (N, 4) m in B: points of an earlier run, and their lag
     question: str = ""  # that an operator must answer before the arm goes there
     summary: str = ""  # the result of the scan, in one sentence
+    weld_pass: int = 0  # number of the pass that it is for, 0: the root
+    felt_line: SeamCurve | None = None  # of the tip in the root pass, for the passes after it
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and
     # torch at one place
     arm_sigma_m: float = np.nan

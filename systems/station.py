@@ -21,6 +21,7 @@ from weldcal.models.tool import LAST_LINK, WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart, bend
 from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
+from weldcal.models.workpieces.tack import tacked
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
@@ -351,6 +352,7 @@ def _workpieces(
     else:
         drawn = part_of(spec)
         cad, real = drawn, made(drawn, spec, rng)
+    real = tacked(real, scenario.welding.tacks_m())
     placed = _lying_error(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )

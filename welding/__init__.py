@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from weldcal.welding.locate.part.model import PartModel
     from weldcal.welding.locate.part.registration import register_part
     from weldcal.welding.locate.part.result import PartConfig, PartNotFound, PartRegistration
+    from weldcal.welding.passes.bead import bead_area, propose_passes
+    from weldcal.welding.passes.felt import PassError, WeldPass
     from weldcal.welding.record.weld_log import WeldRecord, load_weld_log
     from weldcal.welding.seam.curve import SeamCurve, SeamError
     from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamReport, assess_seam, split_seam
@@ -31,6 +33,7 @@ __all__ = [
     "PartModel",
     "PartNotFound",
     "PartRegistration",
+    "PassError",
     "Phase",
     "SeamCurve",
     "SeamError",
@@ -40,14 +43,17 @@ __all__ = [
     "TagModel",
     "TagObservation",
     "TipCalibration",
+    "WeldPass",
     "WeldRecord",
     "WeldingCommand",
     "WeldingState",
     "assess_seam",
+    "bead_area",
     "calibrate_tip",
     "detect_tag",
     "extract_groove",
     "load_weld_log",
+    "propose_passes",
     "register_part",
     "split_seam",
     "welding_step",

@@ -35,6 +35,9 @@ POSITIVE = {
         "length_mm",
         "hole_from_mm",
         "bend_radius_mm",
+        "on_mm",
+        "height_mm",
+        "off_mm",
     ),
     *("maximum_time_s", "control_period_s", "following_error_rad"),
     *("pace", "velocity_share", "spread_deg", "travel_deg"),
@@ -42,8 +45,8 @@ POSITIVE = {
 }
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
-    *("repeatability_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
-    *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
+    *("repeatability_mm", "from_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
+    *("interpass_s", "translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg", "margin_m"),
 }
 LENGTHS = {
@@ -269,6 +272,25 @@ def check_schedule(scenario: Scenario) -> None:
         )
 
 
+def check_tack_order(scenario: Scenario) -> None:
+    """Check the tacks against the seams.
+
+    Raises:
+        InputError: a tack without a length or a seam, or tacks where the seam is interrupted.
+    """
+    welding, spec = scenario.welding, scenario.workpiece
+    seams = 1 if spec is None else max(1, len(spec.seams))
+    for k, tack in enumerate(welding.tacks):
+        if not tack.from_mm < tack.to_mm:
+            raise InputError(
+                f"welding.tacks[{k}].to_mm is {tack.to_mm:g}, and from_mm {tack.from_mm:g}: it must be larger."
+            )
+        if not 1 <= tack.seam <= seams:
+            raise InputError(f"welding.tacks[{k}].seam is {tack.seam}, and the part has seams 1 to {seams}.")
+    if welding.tacks and (welding.pass_obstacles or welding.law != "guarded"):
+        raise InputError("welding.tacks goes with welding.law: guarded and without welding.pass_obstacles.")
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -302,6 +324,11 @@ def check_scenario(scenario: Scenario) -> None:
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
+    if scenario.welding.later_passes() and scenario.welding.pass_obstacles:
+        raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
+    check_tack_order(scenario)
+    if scenario.welding.stitch is not None:
+        scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration

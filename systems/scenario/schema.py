@@ -15,6 +15,8 @@ from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
+from weldcal.welding.passes.felt import WeldPass
+from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.schedule import WeldSchedule
@@ -170,6 +172,52 @@ class WeaveOrder:
 
 
 @dc.dataclass
+class StitchOrder:
+    """Stitches: the arc burns along pieces of the seam only."""
+
+    on_mm: float = 30.0  # length of a piece; the seam's end may cut the last one to a half, a shorter rest is left out
+    off_mm: float = 60.0  # from the end of a piece to the start of the next one
+    from_mm: float = 0.0  # where the first piece starts, so that both sides of a web can be staggered
+
+    def stitch(self) -> StitchConfig:
+        """The order as a StitchConfig."""
+        return StitchConfig(on_m=1e-3 * self.on_mm, off_m=1e-3 * self.off_mm, from_m=1e-3 * self.from_mm)
+
+
+@dc.dataclass(kw_only=True)
+class PassOrder:
+    """A pass: where its torch is beside the root's path, as the root pass has felt it."""
+
+    lateral_mm: float = 0.0  # to the left of the root's travel, square to the joint's bisector
+    vertical_mm: float = 0.0  # along the bisector, out of the joint
+    angle_deg: float = 0.0  # lean of the tool across the seam, the left side up
+    speed_mm_s: float | None = None  # null: welding.speed_mm_s
+    reverse: bool = False  # weld it from the seam's end to its start
+    interpass_s: float = 0.0  # least time since the arc of the pass before went out
+
+    def weld_pass(self) -> WeldPass:
+        """The order as a WeldPass."""
+        return WeldPass(
+            lateral_m=1e-3 * self.lateral_mm,
+            vertical_m=1e-3 * self.vertical_mm,
+            angle_rad=math.radians(self.angle_deg),
+            speed_m_s=None if self.speed_mm_s is None else 1e-3 * self.speed_mm_s,
+            reverse=self.reverse,
+            interpass_s=self.interpass_s,
+        )
+
+
+@dc.dataclass(kw_only=True)
+class TackOrder:
+    """A tack in the joint, over which the tip is lifted."""
+
+    from_mm: float = 0.0  # along the seam
+    to_mm: float = 0.0
+    height_mm: float = 4.0  # of its top over the root
+    seam: int = 1  # number of the seam, from 1
+
+
+@dc.dataclass
 class ArcConfig:
     """How the arc starts and ends."""
 
@@ -227,6 +275,9 @@ class WeldingConfig:
     schedule: WeldSchedule | None = None  # null: no set values; the power source is set by hand
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
+    stitch: StitchOrder | None = None  # null: the arc burns along the whole seam
+    tacks: list[TackOrder] = dc.field(default_factory=list)  # a simulated part has them
+    passes: list[PassOrder] = dc.field(default_factory=list)  # after the root pass, in the order of welding
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
@@ -237,6 +288,14 @@ class WeldingConfig:
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
+
+    def tacks_m(self) -> list[tuple[int, float, float, float]]:
+        """The tacks: number of the seam, from 0, start and end along it, and height over its root, m."""
+        return [(t.seam - 1, 1e-3 * t.from_mm, 1e-3 * t.to_mm, 1e-3 * t.height_mm) for t in self.tacks]
+
+    def later_passes(self) -> tuple[WeldPass, ...]:
+        """The passes after the root."""
+        return tuple(order.weld_pass() for order in self.passes)
 
 
 @dc.dataclass(kw_only=True)

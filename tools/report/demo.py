@@ -37,7 +37,14 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, weave_document
+from weldcal.tools.report.weld import (
+    CalibrationError,
+    WeldOutcome,
+    felt_seams,
+    fit_up_document,
+    pass_documents,
+    weave_document,
+)
 from weldcal.tools.report.weld_record import PartRecord
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.record.weld_log import heat_summary
@@ -235,7 +242,9 @@ class DemoResult:
             seams = [seam_document(error) for error in self.weld.seams]
             found["torch_mean_mm"] = 1e3 * float(self.weld.error.distance_m.mean())
             found |= {key: float(np.nanmax([seam[key] for seam in seams])) for key in seams[0] if "max" in key}
-            if len(seams) > 1:
+            if passes := self.run.cell.scenario.welding.later_passes():
+                found["passes"] = pass_documents(self.weld, passes, seams)
+            elif len(seams) > 1:
                 found["seams"] = seams
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
@@ -246,6 +255,7 @@ class DemoResult:
             found["heat_input_kJ_mm"] = None if heat is None else heat[0]
         if self.record is not None:
             found |= self.record.summary()
+            found["arc_mm"] = [seam.arc_mm for seam in self.record.seams]
         if self.weld is not None and self.weld.weave:
             found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
         if self.weld is not None:

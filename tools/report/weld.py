@@ -25,6 +25,7 @@ from weldcal.systems.runner import Run
 from weldcal.systems.station import Truth
 from weldcal.tools.report.files import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
+from weldcal.welding.passes.felt import WeldPass
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.record.weave import MeasuredWeave, measure_weave
 from weldcal.welding.seam.curve import SeamCurve, ringed
@@ -91,6 +92,7 @@ class WeldOutcome:
     seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
     weave: tuple[MeasuredWeave | None, ...] = ()  # of each seam, where a weave was ordered
     path: Array | None = None  # (N, 3) m of the torch, without its weave
+    plans: tuple[tuple[int, int], ...] = ()  # numbers of seam and pass of each of `seams`, from 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,33 +231,45 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     log, seam = weld_log(cell, root), true_seam(cell.station.truth, number)
     if log is None:
         return None
-    plan = cell.job.planned_seam(root).seam
-    plan_error = None
-    if plan is not None and seam is not None:
+    planned = cell.job.planned_seam(root)
+    plan, plan_error = planned.seam, None
+    if plan is not None and seam is not None and planned.weld_pass == 0:
         lowered = plan.raised(TORCH_ABOVE_ROOT_M - seated_tip(cell.station, number).above_m)
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
-    wanted, weave = cell.job.servo_config.weld_speed_m_s, cell.job.servo_config.weave
+    weave, passes = cell.job.servo_config.weave, cell.scenario.welding.later_passes()
     parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
     if not parts:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
-    numbers = dict(enumerate(record.seam for record in cell.job.planned_seam(root).records))
-    path, errors, woven = log.p_BTorch.copy(), [], []
+    plans = dict(enumerate((record.seam, record.weld_pass) for record in planned.records))
+    path, errors, woven, judged = log.p_BTorch.copy(), [], [], []
     for k, part in enumerate(welds(log)):
-        on, true = part & log.torch_on, true_seam(cell.station.truth, numbers.get(k, k))
+        of_seam, of_pass = plans.get(k, (k, 0))
+        on, true = part & log.torch_on, true_seam(cell.station.truth, of_seam)
+        order = passes[of_pass - 1] if of_pass else WeldPass()
+        if true is not None and of_pass:
+            true = true.raised(order.vertical_m, order.lateral_m)
         curve = plan if true is None and part[-1] else true
         if curve is None or not on.any():
             continue
-        off = path_error(log.p_BTorch[on], curve)
+        off = path_error(log.p_BTorch[on], curve, backwards=order.reverse)
         if weave.amplitude_m:
             woven.append(measure_weave(log.time[on], off, weave.period_s, weave.plane_rad))
             off = _unwoven(log.time[on], off, weave)
             path[on] = curve.position(off.s) + (off.lateral * curve.normal(off.s).T + off.height * curve.up(off.s).T).T
         if true is not None:
             errors.append(off)
-    speed = _together([speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in parts])
+            judged.append((of_seam, of_pass))
+    speeds = []
+    for k, part in enumerate(parts):
+        wanted = cell.job.servo_config.weld_speed_m_s
+        if of_pass := plans.get(k, (k, 0))[1]:
+            wanted = passes[of_pass - 1].speed_m_s or wanted
+        stretches = burns(log, part) if cell.job.servo_config.stitch.on_m else [part]
+        speeds += [speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in stretches]
+    speed = _together(speeds)
     outcome = WeldOutcome(
         log=log,
         true_seam=seam,
@@ -269,7 +283,7 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     if not errors:
         return outcome
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
-    return replace(outcome, error=error, seams=tuple(errors))
+    return replace(outcome, error=error, seams=tuple(errors), plans=tuple(judged))
 
 
 def _unwoven(time: Array, off: PathError, weave: WeaveConfig) -> PathError:
@@ -289,6 +303,21 @@ def _unwoven(time: Array, off: PathError, weave: WeaveConfig) -> PathError:
         height[rows] -= d * across
         s[rows] -= ahead
     return PathError(s, lateral, height)
+
+
+def pass_documents(weld: WeldOutcome, passes: Sequence[WeldPass], errors: list[dict[str, float]]) -> list[object]:
+    """Each pass of each seam: what was ordered, and the torch's error against that."""
+    found: list[object] = []
+    for (seam, number), error in zip(weld.plans, errors, strict=True):
+        order = passes[number - 1] if number else WeldPass()
+        ordered = {
+            "lateral_mm": 1e3 * order.lateral_m,
+            "vertical_mm": 1e3 * order.vertical_m,
+            "angle_deg": math.degrees(order.angle_rad),
+            "reverse": order.reverse,
+        }
+        found.append({"seam": seam + 1, "pass": number + 1, **ordered, **error})
+    return found
 
 
 def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
@@ -341,6 +370,14 @@ def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
     touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
     number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
     return [number == k for k in range(int(number[-1]) + 1)]
+
+
+def burns(log: WeldLog, part: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Masks (N,) of the stretches of a part (N,) along which the torch was on without a pause."""
+    on = part & log.torch_on
+    number = np.cumsum(on & ~np.concatenate([[False], on[:-1]]))
+    found = [on & (number == k) for k in range(1, int(number[-1]) + 1)]
+    return [stretch for stretch in found if stretch.sum() >= 30]
 
 
 def felt_seams(run: Run[WeldJob]) -> list[bool]:

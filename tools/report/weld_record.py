@@ -63,7 +63,7 @@ class PartRecord:
     log: WeldRecord
     seams: tuple[WeldedSeam, ...]
     pictures: dict[str, bytes]
-    plots: dict[int, bytes]  # of the arc, by the seam's number from 1
+    plots: dict[tuple[int, int], bytes]  # of the arc, by the numbers of seam and pass from 1
     stretches: Sequence[dict[str, object]] = ()
     lost: tuple[str, ...] = ()
 
@@ -74,7 +74,7 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
+            f"Seam {_name(seam)}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
             f" {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
@@ -86,7 +86,7 @@ class PartRecord:
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
-        return [(str(seam.seam), *row) for seam in self.seams for row in self.rows_of(seam)]
+        return [(_name(seam), *row) for seam in self.seams for row in self.rows_of(seam)]
 
     def rows_of(self, seam: WeldedSeam) -> list[tuple[str, ...]]:
         """The same rows of one seam, without its number."""
@@ -165,7 +165,7 @@ class PartRecord:
         if ended not in ("", "done") or not seams:
             tone, headline = "bad", f"{what}; the job was held"
         cards = [
-            (f"Seam {seam.seam}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
+            (f"Seam {_name(seam)}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
             for seam in self.seams
             for words in [f"{seam.welded_mm:.0f} mm in {seam.arc_s:.1f} s; arc values {_SOURCES[seam.arc_values]}"]
         ]
@@ -234,7 +234,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "law": config.law,
         "woven": bool(config.weave.amplitude_m),
         "felt": felt_seams(run),
-        "plans": [plan.seam for plan in cell.job.planned_seam(run.root).records],
+        "plans": [(plan.seam, plan.weld_pass) for plan in cell.job.planned_seam(run.root).records],
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
         "schedule": None if cell.scenario.welding.schedule is None else asdict(cell.scenario.welding.schedule),
@@ -251,10 +251,10 @@ def part_record(run: Run[WeldJob], log: WeldRecord, progress: Progress | None = 
     lost: list[str] = []
     if progress is not None:
         log, lost = with_earlier_logs(log, progress)
-    numbers: Sequence[int] = log.settings["plans"]
-    order, of_seam = run.cell.scenario.welding.order, list(seam_rows(log, numbers))
-    seams = [welded_seam(log, number, rows) for number, rows in of_seam]
-    plots = {number + 1: arc_over_time(log, rows, order.limits) for number, rows in of_seam}
+    plans: list[tuple[int, int]] = [(seam, number) for seam, number in log.settings["plans"]]
+    order, of_seam = run.cell.scenario.welding.order, list(seam_rows(log, plans))
+    seams = [welded_seam(log, numbers, rows) for numbers, rows in of_seam]
+    plots = {numbers: arc_over_time(log, rows, order.limits) for numbers, rows in of_seam}
     pictures = {
         f"seam_{seam + 1}_{end}": cv2.imencode(".png", image.pixels)[1].tobytes()
         for seam, images in run.seam_pictures.items()
@@ -266,7 +266,7 @@ def part_record(run: Run[WeldJob], log: WeldRecord, progress: Progress | None = 
         log=log,
         seams=tuple(seam for seam in seams if seam is not None),
         pictures=pictures,
-        plots={number: plot for number, plot in plots.items() if plot is not None},
+        plots={(seam + 1, number + 1): plot for (seam, number), plot in plots.items() if plot is not None},
         stretches=[] if progress is None else stretch_rows(progress),
         lost=tuple(lost),
     )
@@ -301,6 +301,10 @@ def stretch_rows(progress: Progress) -> list[dict[str, object]]:
         }
         for one in progress.stretches
     ]
+
+
+def _name(seam: WeldedSeam) -> str:
+    return str(seam.seam) if seam.weld_pass == 1 else f"{seam.seam}, pass {seam.weld_pass}"
 
 
 def _spread(seam: WeldedSeam, name: str) -> Spread:

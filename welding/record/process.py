@@ -118,7 +118,7 @@ class PathError:
 
     def ends_m(self, length_m: float = END_M) -> tuple[float, float, float]:
         """Largest distance in space over the first and the last stretch, and between them, m; NaN without samples."""
-        first, last = self.s <= self.s[0] + length_m, self.s >= self.s[-1] - length_m
+        first, last = (np.abs(self.s - self.s[k]) <= length_m for k in (0, -1))
         most = (np.max(self.distance_m, where=part, initial=-np.inf) for part in (first, last, ~(first | last)))
         first_m, last_m, between_m = (float(v) if v >= 0.0 else math.nan for v in most)
         return first_m, last_m, between_m
@@ -143,12 +143,13 @@ class SpeedStatistics:
     seconds: float
 
 
-def path_error(p_B: ArrayLike, seam: SeamCurve) -> PathError:
+def path_error(p_B: ArrayLike, seam: SeamCurve, backwards: bool = False) -> PathError:
     """Distance of each point from the true line, in the seam's frame.
 
     Args:
         p_B: (N,3) m, in order of travel.
         seam: the line they should be on, in the same frame.
+        backwards: whether they travel it from its end.
 
     Raises:
         ProcessLogError: no points, or not (N,3).
@@ -157,9 +158,10 @@ def path_error(p_B: ArrayLike, seam: SeamCurve) -> PathError:
     if p.ndim != 2 or p.shape[1] != 3 or not len(p):
         raise ProcessLogError(f"A path needs an (N, 3) array of points in metres; this one has shape {p.shape}.")
     s = np.empty(len(p))
-    s[0] = float(seam.project(p[0]))
-    for i in range(1, len(p)):
-        s[i] = seam.nearest(p[i], s[i - 1])
+    rows = range(len(p))[:: -1 if backwards else 1]
+    s[rows[0]] = at = float(seam.project(p[rows[0]]))
+    for i in rows[1:]:
+        s[i] = at = seam.nearest(p[i], at)
     gap = p - seam.position(s)
     return PathError(s, np.sum(gap * seam.normal(s), axis=1), np.sum(gap * seam.up(s), axis=1))
 

@@ -32,18 +32,21 @@ class WeldedSeam:
     """What was measured of one seam while the arc burned.
 
     Attributes:
-        seam: its number, from 1; welded_mm, arc_s: length and time of the arc.
+        seam, weld_pass: their numbers, from 1; welded_mm, arc_s: length and time of the arc.
         arc_values: measured (by the power source), set (as ordered of it), or unknown.
         figures: by the names of RANGES, over stretches of 10 mm; their means over the seam.
         path_mm: distance of the torch from the felt seam: mean and largest.
+        arc_mm: where along the planned seam the arc burned, (from, to) of each stretch.
     """
 
     seam: int
+    weld_pass: int
     welded_mm: float
     arc_s: float
     arc_values: str
     figures: dict[str, Spread]
     path_mm: Spread
+    arc_mm: tuple[tuple[float, float], ...] = ()
 
     def outside(self, limits: OrderLimits) -> tuple[str, ...]:
         """Names of the limits that the seam exceeds, or that nothing is known of."""
@@ -57,27 +60,32 @@ class WeldedSeam:
         return tuple(found)
 
 
-def seam_rows(record: WeldRecord, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Each seam's number and its rows (N,): the tip is brought into touch once for each plan.
+Numbers = tuple[int, int]
+"""Of a seam and of its pass, from 0."""
+
+
+def seam_rows(record: WeldRecord, plans: Sequence[Numbers]) -> Iterator[tuple[Numbers, NDArray[np.bool_]]]:
+    """The numbers of each seam's passes and their rows (N,): the tip is brought down once for each plan.
 
     Args:
-        numbers: of the seam of each plan, in the order of welding; plans of one seam are its pieces.
+        plans: numbers of each plan, in the order of welding; plans of one pass are its pieces.
     """
     touching = record.phase == "TOUCH"
     plan = np.cumsum(touching & ~np.concatenate([[False], touching[:-1]]))
     plan -= plan[0]
-    seam = np.array([numbers[k] if k < len(numbers) else k for k in range(int(plan[-1]) + 1)])[plan]
-    for number in dict.fromkeys(seam.tolist()):
-        yield number, seam == number
+    found = [plans[k] if k < len(plans) else (k, 0) for k in range(int(plan[-1]) + 1)]
+    for numbers in dict.fromkeys(found):
+        yield numbers, np.isin(plan, [k for k, other in enumerate(found) if other == numbers])
 
 
-def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> WeldedSeam | None:
-    """Return the figures of the seam of these rows (N,); None where its arc did not burn."""
+def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -> WeldedSeam | None:
+    """Return the figures of the pass of a seam of these rows (N,); None where its arc did not burn."""
     on = np.flatnonzero(rows & record.arc)
     if len(on) < LEAST_ROWS:
         return None
     time = record["time_s"]
     dt = np.diff(time[on])
+    burned = np.split(1e3 * record["s_torch_m"][on], np.flatnonzero(dt > GAP_S) + 1)
     dt = np.where(dt > GAP_S, 0.0, dt)
     length = record["torch_speed_m_s"][on][:-1] * dt
     if record.settings.get("woven"):  # metal is deposited along the seam, not along the swings
@@ -94,12 +102,14 @@ def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> Wel
     off = 1e3 * np.hypot(record["e_t_m"][on], record["e_height_m"][on])
     off = off[np.isfinite(off)]
     return WeldedSeam(
-        seam=number + 1,
+        seam=numbers[0] + 1,
+        weld_pass=numbers[1] + 1,
         welded_mm=1e3 * float(length.sum()),
         arc_s=float(dt.sum()),
         arc_values=source,
         figures={name: _spread(*table, stretch) for name, table in tables.items()},
         path_mm=Spread(*map(float, (off.min(), off.mean(), off.max()))) if len(off) else Spread(),
+        arc_mm=tuple((float(np.nanmin(s)), float(np.nanmax(s))) for s in burned if np.isfinite(s).any()),
     )
 
 
@@ -134,7 +144,7 @@ def _spread(above: Array, below: Array, stretch: NDArray[np.int_]) -> Spread:
 _PARTS = ("least", "mean", "most", "from", "to")
 RECORD_COLUMNS = (
     *WeldOrder().texts,
-    *("written", "seam", "ended", "welded_mm", "arc_s", "arc_values"),
+    *("written", "seam", "pass", "ended", "welded_mm", "arc_s", "arc_values"),
     *(f"{name}_{part}" for name in RANGES for part in _PARTS),
     *("path_mm_mean", "path_mm_most", "path_mm_to", "within_limits", "outside"),
     *("picture_start", "picture_end", "software", "scenario", "seed"),
@@ -145,7 +155,12 @@ RECORD_COLUMNS = (
 def record_row(found: WeldedSeam, order: WeldOrder, others: dict[str, object]) -> dict[str, object]:
     """A row of record.csv by RECORD_COLUMNS: `others` are its values that are not of the weld; empty: not known."""
     row: dict[str, object] = {**order.texts, **others}
-    row |= {"seam": found.seam, "welded_mm": _cell(found.welded_mm), "arc_s": _cell(found.arc_s)}
+    row |= {
+        "seam": found.seam,
+        "pass": found.weld_pass,
+        "welded_mm": _cell(found.welded_mm),
+        "arc_s": _cell(found.arc_s),
+    }
     row["arc_values"] = found.arc_values
     for name in RANGES:
         low, high = getattr(order.limits, name) or (math.nan, math.nan)

@@ -11,6 +11,8 @@ from weldcal.welding.seam.refinement import drop_pending, refine, tip_point
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Measurement, Phase, ServoSample, WeldingState
 
+_PRESSED = 0.9  # a choice: of the wanted deflections; a gain of 8 % less still passes
+
 
 def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
     """Whether the sample carries a valid frame that has not been used; a frame from the future is not one."""
@@ -149,6 +151,11 @@ def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -
 def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     """The state with its newest tactile point queued, the oldest committed, and the plan moved onto the points."""
     deflection = config.deflection
+    if state.settling:  # after a tack: until it is pressed in again, the ball rests higher
+        pressed = min(state.delta_n / deflection.delta_d_m, state.delta_axial / deflection.axial_d_m)
+        if pressed < _PRESSED:
+            return changed(state, refined=drop_pending(state.refined))
+        state = changed(state, settling=False)
     assert state.measurement is not None
     assert state.plan_fit is not None
     proven = state.proven or state.delta_n > 0.5 * deflection.delta_d_m

@@ -75,7 +75,7 @@ def finish(state: WeldingState) -> WeldingState:
 def raised(state: WeldingState, config: ServoConfig) -> WeldingState:
     """Check, until the arc is lit, that a tip that was seated above the plan does not fall: it was not in the root."""
     t, fit, last = state.touch, state.plan_fit, state.measurement
-    if math.isnan(t.raised_m) or state.torch_on or fit is None or last is None:
+    if math.isnan(t.raised_m) or math.isfinite(state.lit_at) or fit is None or last is None:
         return state
     frame = fit.plan.frame(state.s_tip)
     rise = dot(last.point - frame.position, frame.up) - t.raised_m
@@ -86,8 +86,12 @@ def raised(state: WeldingState, config: ServoConfig) -> WeldingState:
 
 
 def unlit(state: WeldingState, s_torch: float, past_start: float, error: float, config: ServoConfig) -> str | None:
-    """Fault sentence where the arc is still not lit so far past the seam's start, or at its end, else None."""
-    if math.isfinite(state.lit_at) or (past_start <= config.torch.ignition_window_m and s_torch < state.s_end):
+    """Fault sentence where the arc is still not lit so far past the piece's start, or at the seam's end, else None."""
+    on_m, window_m = config.stitch.on_m, config.torch.ignition_window_m
+    if on_m:
+        window_m = min(window_m, 0.5 * on_m)
+    lit = state.torch_on if on_m else math.isfinite(state.lit_at)
+    if lit or (past_start <= window_m and (s_torch < state.s_end or math.isfinite(state.lit_at))):
         return None
     return (
         f"Not welded: {1e3 * past_start:.0f} mm past the seam's start the arc is not lit, because the torch is"

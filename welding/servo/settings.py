@@ -5,12 +5,15 @@ The defaults are those of docs/weld_law.md.
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Real
 
 import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
+from weldcal.welding.passes.stitch import StitchConfig
+from weldcal.welding.passes.tacks import Hop, Tack, check_tacks, hops
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.seam.plan_fit import PlanFitConfig
 from weldcal.welding.seam.refinement import RefinementConfig
@@ -342,6 +345,8 @@ class ServoConfig:
     plan_fit: PlanFitConfig = field(default_factory=PlanFitConfig)
     windows: SeamWindows = field(default_factory=SeamWindows)
     weave: WeaveConfig = field(default_factory=WeaveConfig)
+    stitch: StitchConfig = field(default_factory=StitchConfig)
+    tacks: tuple[Tack, ...] = ()
     weld_speed_m_s: float = 8.0e-3
     period_s: float = 0.008
     lag_s: float = 0.025
@@ -355,8 +360,20 @@ class ServoConfig:
         _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
+        self.stitch.check(self.weld_speed_m_s)
+        if self.tacks and self.felt:
+            check_tacks(self.tacks, self.hops, self.touch.arc_m, self.tool.torch_offset_m, self.weld_speed_m_s)
         if self.weave.amplitude_m:
             check_weave(self.weave, self.weave_bounds(self.weave))
+
+    @cached_property
+    def hops(self) -> tuple[Hop, ...]:
+        """The lifts of the tip over the tacks."""
+        return hops(self.tacks, self.weld_speed_m_s, self.deflection.axial_d_m)
+
+    def hop_at(self, s: float) -> Hop | None:
+        """Return the lift that the tip is in at an arc length s m of the seam."""
+        return next((hop for hop in self.hops if hop.begin <= s < hop.end), None) if self.tacks else None
 
     def weave_bounds(self, weave: WeaveConfig) -> list[Bound]:
         """The tool's limits of a weave."""

@@ -160,6 +160,7 @@ class WeldingState:
     axial_paused: bool = False
     regained: int = 0
     proven: bool = False
+    settling: bool = False
     progress: float = 0.0
     furthest: float = -math.inf
     progress_log: tuple[tuple[float, float], ...] = ()
@@ -182,6 +183,7 @@ class WeldingState:
     advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
     lit_at: float = math.nan
+    stitched_to: float = 0.0
     weave: Learnt = field(default_factory=Learnt)
     arc_seen: bool = False
     arc_waited_s: float = 0.0

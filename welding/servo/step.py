@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from weldcal.welding.numerics import Array, changed, clip, dot, finite
+from weldcal.welding.passes.stitch import Stitch
+from weldcal.welding.passes.tacks import LIFT_M_S, SLEW_M_S2
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
@@ -36,6 +38,20 @@ def start_arc(state: WeldingState, curve: SeamCurve) -> float:
     The measured start of the groove, else the planned one.
     """
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
+
+
+def current_piece(state: WeldingState, config: ServoConfig) -> Stitch | None:
+    """Return the piece of the seam that is welded, or will be next; None after the last one."""
+    assert state.plan_fit is not None
+    start = start_arc(state, state.plan_fit.curve)
+    return config.stitch.piece(max(state.stitched_to, start), start, state.s_end)
+
+
+def stitched(state: WeldingState, config: ServoConfig) -> WeldingState:
+    """Return the state after a piece: the arc off, and not seen yet in the next one."""
+    piece = current_piece(state, config)
+    to = state.s_end if piece is None else piece.end
+    return changed(state, torch_on=False, arc_seen=False, arc_waited_s=0.0, stitched_to=to)
 
 
 def with_arc(state: WeldingState, sample: ServoSample) -> WeldingState:
@@ -80,6 +96,8 @@ def wait_for_arc(
     return state, share * V_stop, reason
 
 
+_DOWN_SHARE = 0.5  # a choice: of the wanted deflection, at which the ball is firmly in its joint
+_IN_JOINT_M = 1.0e-3  # a choice: half of the lowest tack
 _THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 
@@ -127,6 +145,9 @@ def welding_step(
         return _answer(state, V, config, Diagnostics()) if problem is None else _rest(fault(state, problem), config)
     if state.phase in _MOVING and state.stand:
         state, V, over = stand_step(with_arc(state, sample), sample, config, dt)
+        if over and config.stitch.on_m:
+            state = changed(stitched(state, config), stand=Stand.NONE)
+            over = state.stitched_to >= state.s_end
         return _rest(_done(state), config) if over else _answer(state, V, config, Diagnostics())
     if state.phase in _MOVING:
         return _weld(with_arc(state, sample), sample, config, dt)
@@ -200,6 +221,8 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
+        if law.guarded and (hop := config.hop_at(state.s_tip)) is not None and state.s_tip < hop.up:
+            return changed(_coasting(drop(state), hop.down), settling=True)
         if not law.guarded:
             # The paper appends every point and does not detect contact; the wanted deflection without contact is an
             # interpretation.
@@ -210,7 +233,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             )
         if not lost:
             return with_point(raised(state, config), config)
-        state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
+        state = drop(state)
         if state.s_tip > state.s_end - end_window:
             assert before.measurement is not None
             assert state.plan_fit is not None
@@ -219,23 +242,39 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             if goes_on(state, config):
                 high = state.s_end
             return changed(finish(state), s_end=clip(last, low, high))
-        return changed(
-            state,
-            phase=Phase.COAST,
-            lost_at=state.s_tip,
-            lost_time=state.frame_time,
-            residual_at_loss=_tip_residual(state),
-        )
+        return _coasting(state, state.s_tip)
     if state.phase == Phase.COAST:
         # Just after the loss the springs are still relaxing: that is not a new contact.
         waited = state.frame_time - state.lost_time > limits.regain_after_s
         settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
-        touching = settled and state.delta_axial > limits.regain_axial_m
+        touching = settled and state.delta_axial > limits.regain_axial_m and _as_low_as_before(state)
         regained = state.regained + 1 if touching else 0
         if regained >= limits.regain_frames:
             return changed(state, phase=Phase.TRACK, regained=0, proven=False)
         return changed(state, regained=regained)
     return state
+
+
+def drop(state: WeldingState) -> WeldingState:
+    """Return the state of a tip whose last points do not count."""
+    return changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
+
+
+def _coasting(state: WeldingState, lost_at: float) -> WeldingState:
+    """Return the state that coasts on the moved plan and what it was off; contact counts again from `lost_at` m."""
+    residual = _tip_residual(state)
+    return changed(state, phase=Phase.COAST, lost_at=lost_at, lost_time=state.frame_time, residual_at_loss=residual)
+
+
+def _as_low_as_before(state: WeldingState) -> bool:
+    """Whether a tip that comes down after a tack is in the joint, not on the tack or on the face beside."""
+    if not state.settling:
+        return True
+    assert state.measurement is not None
+    assert state.plan_fit is not None
+    point = state.measurement.point
+    _, above = mean_residual(point[None], state.plan_fit.curve, state.s_tip)
+    return bool(above - state.residual_at_loss[1] < _IN_JOINT_M)
 
 
 def _tip_residual(state: WeldingState) -> Array:
@@ -299,17 +338,18 @@ def _weld(
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(fault(state, text), config)
     # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
-    start, torch = start_arc(state, curve), config.torch
-    on_the_way = way_to_rest_m(motion.v_torch, config)
-    there = target.s >= start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
-    burning = (state.torch_on or there) and target.s < state.s_end
-    if burning and not state.torch_on and torch.from_rest:
-        return _stand(state, motion.V_BT, Stand.START, config)
-    if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= state.s_end - on_the_way:
-        return _stand(state, motion.V_BT, Stand.CRATER, config)
-    lit_at = sample.time if burning and not state.torch_on else state.lit_at
-    state = changed(state, torch_on=burning, lit_at=lit_at)
-    problem = unlit(state, target.s, target.s - start, error, config)
+    piece, torch, on_the_way = current_piece(state, config), config.torch, way_to_rest_m(motion.v_torch, config)
+    if piece is not None:
+        there = target.s >= piece.start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
+        burning = (state.torch_on or there) and target.s < piece.end
+        if burning and not state.torch_on and torch.from_rest:
+            return _stand(state, motion.V_BT, Stand.START, config)
+        if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= piece.end - on_the_way:
+            return _stand(state, motion.V_BT, Stand.CRATER, config)
+        lit_at = sample.time if burning and not state.torch_on else state.lit_at
+        over = config.stitch.on_m > 0.0 and state.torch_on and not burning
+        state = stitched(state, config) if over else changed(state, torch_on=burning, lit_at=lit_at)
+        problem = None if over else unlit(state, target.s, target.s - piece.start, error, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
     if target.s >= state.s_end:
@@ -352,18 +392,25 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
-    wanted = state.residual_at_loss + np.array((0.0, -config.gap.hover_m)) if state.phase == Phase.COAST else state.hold
+    wanted, rise = state.hold, 0.0
+    if state.phase == Phase.COAST:
+        # after a tack the plan may have come off by more than over a gap: the tip comes down deeper
+        height = -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m
+        hop = config.hop_at(state.s_tip)
+        if hop is not None:
+            height, slope = hop.place(state.s_tip, -deflection.axial_d_m, height)
+            rise = slope * state.v_tip
+        wanted = state.residual_at_loss + np.array((0.0, height))
     gap = wanted - off
-    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1])
+    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1]) + rise
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
     """The state with the servo speeds limited in speed and slew."""
     deflection = config.deflection
-    top, step = (
-        max(deflection.speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
-        deflection.slew_m_s2 * dt,
-    )
+    hops = state.phase == Phase.COAST and config.hop_at(state.s_tip) is not None
+    faster = LIFT_M_S if hops else config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0
+    top, step = max(deflection.speed_m_s, faster), (SLEW_M_S2 if hops else deflection.slew_m_s2) * dt
     u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
     u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
     return changed(state, u_n=u_n, u_a=u_a)

@@ -143,6 +143,8 @@ SHARES = {
     "approach": 0.36,
     "weld": 0.38,
     "retract": 0.96,
+    "interpass": 0.97,
+    "plan_pass": 0.97,
     "home": 0.97,
     "done": 0.98,
     "held": 0.98,
@@ -163,6 +165,7 @@ class WeldJob(AddedJob):
     seam: OutputPort
     report: OutputPort
     seams: int = 1
+    passes: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
@@ -206,15 +209,19 @@ class WeldJob(AddedJob):
         if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
-        detail = f"seam {command.seam + 1} of {seams}" if seams > 1 and share >= SHARES["approach_above"] else ""
+        welds, weld = seams * self.passes, command.seam * self.passes + command.weld_pass
+        counted = [("seam", command.seam, seams), ("pass", command.weld_pass, self.passes)]
+        detail = ", ".join(f"{name} {k + 1} of {n}" for name, k, n in counted if n > 1)
+        if share < SHARES["approach_above"]:
+            detail = ""
         report, planned = self.servo_report(root), self.planned_seam(root).seam
         if phase == "weld" and report.command is not None and planned is not None:
             at = report.command.diagnostics.s_torch
             along = min(max(at, 0.0), planned.length) if np.isfinite(at) else 0.0
             share += 0.58 * along / planned.length
             detail = ", ".join(filter(None, (detail, f"{1e3 * along:.0f} of {1e3 * planned.length:.0f} mm")))
-        if seams > 1 and share > SHARES["park"]:
-            share = SHARES["park"] + (1.0 - SHARES["park"]) * (command.seam + share) / seams
+        if welds > 1 and share > SHARES["park"]:
+            share = SHARES["park"] + (1.0 - SHARES["park"]) * (weld + share) / welds
         return phase_words(phase, detail), share
 
 
@@ -297,6 +304,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             ports=ports,
             maximum_time_s=times.maximum_time_s,
             seams=times.seams,
+            passes=1 + len(times.interpass_s),
         )
 
 
@@ -326,6 +334,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         X_BC_sigma_m=None if sigma_mm is None else 1e-3 * sigma_mm,
         tolerance_m=1e-3 * welding.tolerance_mm,
         pass_obstacles=welding.pass_obstacles,
+        passes=welding.later_passes(),
         limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
         schedule=welding.schedule,
     )
@@ -359,10 +368,11 @@ def _add_welding(
             "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write"
             " workpiece.located_by: scan."
         )
+    more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
     planner = wiring.add(
         "seam_planner",
         kind(
-            seam_planning(scenario, station, config),
+            replace(seam_planning(scenario, station, config), configs=(config, *more)),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,
             X_FC_known=None if carried is None else carried.pose(),
@@ -376,9 +386,8 @@ def _add_welding(
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
     more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
-    servo = wiring.add(
-        "welding_servo", WeldingVelocityServo(station.arm, tool, config, more, scenario.welding.schedule)
-    )
+    passes, schedule_order = scenario.welding.later_passes(), scenario.welding.schedule
+    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, more, passes, schedule_order))
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),
@@ -404,6 +413,7 @@ def _add_welding(
     for port in ("power_source.set_values", "arm.set_values"):
         if station.diagram.HasInputPort(port):
             wiring.feed(port, schedule.GetOutputPort("set_values"))
+    wiring.connect(planner, servo_report=servo.GetOutputPort("servo_report"))
     guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
     wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=position)
     logged = {

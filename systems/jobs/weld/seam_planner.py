@@ -10,6 +10,7 @@ import numpy.typing as npt
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
+from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, expected_factors
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
@@ -22,15 +23,19 @@ from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
-from weldcal.welding.seam.clearance import NoClearance, check_beside, check_ends, clear_pieces
+from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.restart import Restart
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -70,6 +75,7 @@ def plan_root_anyhow(
 
 
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
+TACK_BESIDE_M = 3e-3  # a choice: about a tack, above what a scan and a list are off along the seam
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
@@ -104,6 +110,8 @@ class SeamPlanning(Welder):
     number: int = 0  # of the seam
     restart: Restart | None = None  # the weld goes on there
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
+    passes: tuple[WeldPass, ...] = ()  # after the root
+    configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
 
     def goes_on(self) -> bool:
         """Whether this seam, or its piece, is the broken one."""
@@ -114,6 +122,19 @@ class SeamPlanning(Welder):
         if self.method.method == "cloud":
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
+
+    def of_seam(self, number: int) -> Self:
+        """Return what the seam of this number is planned from."""
+        config = self.configs[number] if number < len(self.configs) else self.config
+        return dc.replace(self, workpiece=numbered(self.workpiece, number), number=number, config=config)
+
+    def without_tacks(self, points_B: Array, seam: SeamCurve) -> Array:
+        """The points (n, 3) m of a scan that are not of the ordered tacks; the seam is the tip's line."""
+        for tack in self.config.tacks:
+            s = np.arange(tack.start - TACK_BESIDE_M, tack.end + TACK_BESIDE_M, 1e-3)
+            reach = self.tool.tip_radius_m + tack.lift + TACK_BESIDE_M
+            points_B = points_B[np.asarray(cKDTree(seam.position(s)).query(points_B)[0]) > reach]
+        return points_B
 
     def field_at(self, points_B: Array) -> Array:
         """The local field (n, 3) m at points (n, 3) m of the part, for the flange's orientation in the drawn weld.
@@ -148,6 +169,29 @@ class SeamPlanning(Welder):
         check_travel(seam, self.config)
         return find_way(self, seam, X_BP, leans)
 
+    def pass_way(self, felt: SeamCurve, number: int, X_BP: RigidTransform | None) -> tuple[SeamCurve, ArmWay]:
+        """Plan a pass after the root by its number, from 1, beside the felt line of the tip.
+
+        Raises:
+            InfeasiblePath: the arm cannot follow.
+            WeldcalError: as `way`.
+        """
+        tool, order = self.tool, self.passes[number - 1]
+        config, ahead_m = pass_config(self.config, order, tool.tip_radius_m), TIP_AHEAD * tool.chord_m
+        seam = pass_line(felt, order, self.config, tool.tip_radius_m, ahead_m, OVERLAP_M)
+        check_length(seam, config)
+        try:
+            if X_BP is not None:
+                fits = (tool.capsules(), tool.X_FT, tool.chord_m, order.lean_rad)
+                check_clearance(self.workpiece.mesh, X_BP, seam, *fits)
+                check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
+            check_feasible(seam, tool.chord_m, config.weld_speed_m_s, config.windows)
+            check_travel(seam, config)
+            way = find_way(dc.replace(self, config=config, advises=False), seam, X_BP, [order.lean_rad])
+        except WeldcalError as problem:
+            raise PassError(f"welding.passes[{number}]: {problem}") from problem
+        return seam, way
+
 
 class SeamPlanner(BackgroundSystem):
     """Plans the seam from the workpiece's scan, with its CAD or from the cloud only, and maps it to the base by X_BC.
@@ -159,6 +203,7 @@ class SeamPlanner(BackgroundSystem):
         - scan
         - job
         - calibration_status
+        - servo_report
         - history
         output_ports:
         - planned_seam
@@ -181,6 +226,7 @@ class SeamPlanner(BackgroundSystem):
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._report = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
 
     def restarted(self, restart: Restart) -> Self:
@@ -192,6 +238,10 @@ class SeamPlanner(BackgroundSystem):
         """Ask for the plan from a new scan of the workpiece."""
         scan: Scan = self._scan.Eval(context)
         job: JobCommand = self._job.Eval(context)
+        if job.weld_pass > newest.weld_pass and newest.reason is None:
+            planning = self._planning.of_seam(job.seam)
+            report: ServoReport = self._report.Eval(context)
+            return self.background.ask(plan_pass, planning, newest, job.weld_pass, report.state)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
             return None
         X_BC, correction, planning = self._X_BC_known, ScannerCorrection(), self._planning
@@ -208,13 +258,7 @@ class SeamPlanner(BackgroundSystem):
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
-        planning = dc.replace(
-            planning,
-            workpiece=numbered(planning.workpiece, job.seam),
-            number=job.seam,
-            piece=job.piece,
-            earlier=newest.records,
-        )
+        planning = dc.replace(planning.of_seam(job.seam), piece=job.piece, earlier=newest.records)
         views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
         if job.view + 1 < job.views and X_BC is not None:
             return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views, records=newest.records))
@@ -227,6 +271,29 @@ class SeamPlanner(BackgroundSystem):
 
 def _kept(plan: PlannedSeam) -> PlannedSeam:
     return plan
+
+
+def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: WeldingState | None) -> PlannedSeam:
+    """Plan the pass of this number after the root, or after the pass before it, from what the tip felt in the root."""
+    felt = root.felt_line
+    if felt is None:
+        assert state is not None
+        felt = felt_line(state, TIP_AHEAD * planning.tool.chord_m)
+    record = SeamRecord(root.records[-1].seam if root.records else 0, weld_pass=number)
+    plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
+    try:
+        seam, way = planning.pass_way(felt, number, root.X_BP)
+    except WeldcalError as error:
+        return dc.replace(plan, seam=None, reason=str(error))
+    return dc.replace(
+        plan,
+        seam=seam,
+        q_start=way.q_start,
+        q_above=way.q_above,
+        q_retract=way.q_retract,
+        lean_rad=way.lean_rad,
+        touch_arc_m=None,
+    )
 
 
 def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, correction: ScannerCorrection) -> Array:
@@ -269,7 +336,7 @@ def plan_seam(
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = whole = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            beside = (points_B, planning.workpiece.mesh, found.X_BP)
+            beside = (planning.without_tacks(points_B, seam), planning.workpiece.mesh, found.X_BP)
             if planning.pass_obstacles:
                 stops: list[float] = []
                 check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
@@ -427,6 +494,8 @@ def unfelt_sigma(planning: SeamPlanning, found: RootPlan, at: npt.NDArray[np.int
 def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
     """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
     way = planning.way(seam, X_BP)
+    for number in range(1, len(planning.passes) + 1):  # before the root is welded
+        planning.pass_way(seam, number, X_BP)
     felt = is_felt(planning.workpiece, planning.tool)
     share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
@@ -492,6 +561,7 @@ class DrawnSeamPlanner(SeamPlanner):
         - scan
         - job
         - calibration_status
+        - servo_report
         - history
         output_ports:
         - planned_seam

@@ -20,9 +20,9 @@ NOT_HOME = (
     " the pendant, then resume the weld again."
 )
 SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
-WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
+WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "interpass", "plan_pass", "home")
 """Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
-WELDED = ("weld", "retract", "home")
+WELDED = ("weld", "retract", "interpass", "plan_pass", "home")
 """Phases in which a scanner that has moved is a warning: nothing that follows depends on its pose."""
 
 
@@ -43,6 +43,7 @@ class JobPlan:
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
     seams: int = 1
+    interpass_s: tuple[float, ...] = ()  # of each pass after the root
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
     first: tuple[int, int] | None = None  # seam and piece with which a broken weld goes on; None: a new weld
 
@@ -58,6 +59,7 @@ class JobState(ProcedureState):
         process_on: the process is enabled.
         view: number of the newest scan of the workpiece, from 0.
         seam: number of the seam that is planned and welded, from 0; piece: of that seam's pieces.
+        weld_pass: number of its pass, 0: the root; arc_out_s: when the arc of the last one went out.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
         question: what the operator must answer now.
@@ -70,6 +72,8 @@ class JobState(ProcedureState):
     seam: int = 0
     view: int = 0
     piece: int = 0
+    weld_pass: int = 0
+    arc_out_s: float = 0.0
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
     warnings: tuple[str, ...] = ()
     question: str = ""
@@ -150,7 +154,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
     inputs = JobInputs
     moves = (
         *("move_home", "move_to_verification_cloud", "move_to_pose", "move_to_verify", "park"),
-        *("move_to_scan", "leave_scan"),
+        *("move_to_scan", "leave_scan", "interpass"),
         *("approach_above", "approach", "retract", "home"),
     )
     driven = ("weld",)
@@ -218,6 +222,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             views=max(1, len(self._plan.scan_poses)),
             piece=s.piece,
             question=s.question,
+            weld_pass=s.weld_pass,
         )
 
     def flag(self, name: str, s: JobState) -> bool:
@@ -328,17 +333,32 @@ class JobSequencer(Procedure[JobState, JobInputs]):
                 s, now, "The arm came too near to a singular position during the weld; move the workpiece or the seam."
             )
         if now.servo_report.phase == "DONE" and now.planned_seam.q_retract is not None:
-            return self.go(s, now, "retract", now.planned_seam.q_retract, process_on=False, streaming=False)
+            return self.go(
+                s, now, "retract", now.planned_seam.q_retract, process_on=False, streaming=False, arc_out_s=now.time
+            )
         return s
 
     def _retracted(self, s: JobState, now: JobInputs) -> JobState:
         if now.planned_seam.more:
             return self._homeward(s, now, "park", piece=s.piece + 1)
+        if s.weld_pass < len(self._plan.interpass_s):
+            return self._homeward(s, now, "interpass", weld_pass=s.weld_pass + 1)
         number = s.seam + 1
         if number < self._plan.seams:
             # The part is scanned again, for the seam that was welded may have moved it.
-            return self._homeward(s, now, "park", seam=number, piece=0)
+            return self._homeward(s, now, "park", seam=number, piece=0, weld_pass=0)
         return self._homeward(s, now, "home")
+
+    def _at_home(self, s: JobState, now: JobInputs) -> JobState:
+        return self.enter(s, now, "plan_pass")
+
+    def _pass_planned(self, s: JobState, now: JobInputs) -> JobState:
+        planned = now.planned_seam
+        if planned.weld_pass != s.weld_pass:
+            return s
+        if planned.seam is None:
+            return self.held(s, now, planned.reason or "The next pass could not be planned.")
+        return self._approach(s, now) if now.time - s.arc_out_s >= self._plan.interpass_s[s.weld_pass - 1] else s
 
     steps: ClassVar = {
         "start": _start,
@@ -358,6 +378,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         "approach": _approached,
         "weld": _welding,
         "retract": _retracted,
+        "interpass": _at_home,
+        "plan_pass": _pass_planned,
         "home": Procedure.end,
     }
 

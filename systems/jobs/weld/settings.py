@@ -27,6 +27,8 @@ from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TI
 from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.welding.passes.stitch import StitchConfig
+from weldcal.welding.passes.tacks import Tack
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
@@ -131,6 +133,11 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
     felt = is_felt(cad, tool)
     if not felt:
         press = Press(_UNPRESSED_M, _UNPRESSED_M)
+    tacks = tuple(
+        Tack(a, b, lift)
+        for k, a, b, height in welding.tacks_m()
+        if k == seam and (lift := height + tool.tip_radius_m - seat.above_m) > 0.0
+    )
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -145,6 +152,8 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        tacks=tacks,
+        stitch=StitchConfig() if welding.stitch is None else welding.stitch.stitch(),
         windows=SeamWindows.of(tool),
         felt=felt,
         torch=TorchControl(
@@ -303,6 +312,7 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
     seams = max(1, listed if cad is None else seam_count(cad))
     pieces = 2 if scenario.welding.pass_obstacles else 1
+    interpass_s = tuple(order.interpass_s for order in scenario.welding.later_passes())
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
@@ -315,8 +325,9 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         minimum_scans=c.minimum_scans,
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
-        maximum_time_s=job.maximum_time_s * slower * seams * pieces,
+        maximum_time_s=(job.maximum_time_s * slower * pieces * (1 + len(interpass_s)) + sum(interpass_s)) * seams,
         seams=seams,
+        interpass_s=interpass_s,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )
 

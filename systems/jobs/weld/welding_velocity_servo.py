@@ -16,6 +16,7 @@ from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
 from weldcal.welding.numerics import changed
+from weldcal.welding.passes.felt import WeldPass, pass_config
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule
 from weldcal.welding.servo.felt_before import start_state
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
@@ -45,6 +46,7 @@ class ServoReport(Message):
     time: float = np.nan  # of the robot's sample, on the Diagram's clock, s
     X_BT: RigidTransform | None = None  # measured at that tick
     plan: int = 0  # sequence of the plan that is followed
+    weld_pass: int = 0
     interruption: Interruption = dc.field(default_factory=Interruption)  # an operator's hold
 
     @property
@@ -96,11 +98,13 @@ class WeldingVelocityServo(LeafSystem):
         tool: WeldingTool,
         config: ServoConfig,
         others: Sequence[ServoConfig] = (),
+        passes: Sequence[WeldPass] = (),
         schedule: WeldSchedule | None = None,
     ) -> None:
         super().__init__()
-        self._arm, self._tool, self._configs = arm, tool, (config, *others)
-        self._schedule = schedule
+        self._arm, self._tool, self._schedule = arm, tool, schedule
+        radius_m = tool.tip_radius_m
+        self._configs = [(c, *(pass_config(c, order, radius_m) for order in passes)) for c in (config, *others)]
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._deformation = self.DeclareAbstractInputPort("deformation", AbstractValue.Make(Deformation()))
         self._q = self.DeclareVectorInputPort("position_measured", 6)
@@ -122,8 +126,9 @@ class WeldingVelocityServo(LeafSystem):
         old: ServoReport = context.get_abstract_state(self._state).get_value()
         planned: PlannedSeam = self._seam.Eval(context)
         if job.mode != "weld" or planned.seam is None:
-            if old.phase == Phase.DONE and planned.sequence > old.plan and planned.seam is not None:
-                # The next seam is planned: what is reported of the last one would end it at once.
+            newer = (planned.sequence, planned.weld_pass) > (old.plan, old.weld_pass)
+            if old.phase == Phase.DONE and newer and planned.seam is not None:
+                # The next seam or pass is planned: what is reported of the last one would end it at once.
                 state.get_mutable_abstract_state(self._state).set_value(ServoReport())
             elif old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
                 report = dc.replace(old, phase="IDLE", torch_on=False, command=None, interruption=Interruption())
@@ -134,7 +139,7 @@ class WeldingVelocityServo(LeafSystem):
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else start_state(planned.felt_before)
-        config = self._configs[min(job.seam, len(self._configs) - 1)]
+        config = self._configs[min(job.seam, len(self._configs) - 1)][planned.weld_pass]
         config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
         if self._schedule is not None:
             config = at_gap(config, self._schedule, planned.gap, memory)
@@ -149,6 +154,7 @@ class WeldingVelocityServo(LeafSystem):
             time=sample.time,
             X_BT=sample.X_BT,
             plan=planned.sequence,
+            weld_pass=planned.weld_pass,
             interruption=held,
         )
         state.get_mutable_abstract_state(self._state).set_value(report)

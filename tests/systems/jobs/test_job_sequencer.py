@@ -144,9 +144,40 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.arrive() == "done"
     assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
     passed = [phase for _, phase in world.state.log]
-    assert {*PHASES, "done"} == {*passed, "move_home", "move_to_scan", "leave_scan", "confirm"}, (
-        "it stood at home already"
-    )
+    others = {"move_home", "move_to_scan", "leave_scan", "interpass", "plan_pass", "confirm"}
+    assert {*PHASES, "done"} == {*passed, *others}, "it stood at home already, and one pass was ordered"
+
+
+def test_each_pass_waits_for_its_plan_and_for_the_interpass_time() -> None:
+    world = World(dc.replace(PLAN, interpass_s=(5.0, 40.0)), JobState(phase="weld", goal_id=5, process_on=True))
+    planned = PLANNED
+    for number in (1, 2):
+        assert world.look(1.0, planned_seam=planned, servo_report=ServoReport(phase="DONE")) == "retract"
+        out_s = world.time
+        assert world.arrive() == "interpass"
+        assert world.command.q_goal is PLAN.q_home
+        assert world.arrive() == "plan_pass"
+        assert world.command.weld_pass == number
+        assert world.look(1.0, servo_report=ServoReport()) == "plan_pass", "the plan of the pass before is no plan"
+        planned = dc.replace(PLANNED, weld_pass=number, q_above=np.full(6, 0.2 + number))
+        while world.look(1.0, planned_seam=planned) == "plan_pass":
+            pass
+        assert world.phase == "approach_above"
+        assert world.command.q_goal is planned.q_above
+        assert world.time - out_s == pytest.approx((5.0, 40.0)[number - 1], abs=4.0)
+        assert world.time - out_s >= (5.0, 40.0)[number - 1]
+        assert world.arrive() == "approach"
+        assert world.arrive() == "weld"
+    assert world.look(1.0, servo_report=ServoReport(phase="DONE")) == "retract"
+    assert world.arrive() == "home"
+
+
+def test_a_pass_that_cannot_be_planned_holds_the_job() -> None:
+    state = JobState(phase="plan_pass", goal_id=5, weld_pass=1)
+    world = World(dc.replace(PLAN, interpass_s=(0.0,)), state)
+    why = PlannedSeam(sequence=99, weld_pass=1, reason="welding.passes[1]: the arm does not reach it.")
+    assert world.look(0.3, planned_seam=why) == "held"
+    assert world.state.reason == why.reason
     assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
 
 

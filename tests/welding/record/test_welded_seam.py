@@ -36,7 +36,7 @@ def log(speeds: list[float], process: WeldProcess = MAG, **columns: list[float])
 
 
 def only(record: WeldRecord) -> WeldedSeam:
-    (found,) = (welded_seam(record, number, rows) for number, rows in seam_rows(record, [0]))
+    (found,) = (welded_seam(record, number, rows) for number, rows in seam_rows(record, [(0, 0)]))
     assert found is not None
     return found
 
@@ -75,6 +75,14 @@ def test_what_the_schedule_sets_counts_before_the_process() -> None:
     assert (measured.arc_values, measured.figures["current_A"].mean) == ("measured", pytest.approx(110.0))
 
 
+def test_the_record_states_where_the_arc_burned() -> None:
+    pause = log([0.010] * 351, s_torch_m=(1e-5 * 8 * np.arange(351)).tolist())
+    pause.columns["torch_on"][105:255] = 0.0  # 12 mm, from 8 mm on
+    found = only(pause)
+    assert np.array(found.arc_mm) == pytest.approx(np.array([[0.0, 8.0], [20.0, 28.0]]), abs=0.1)
+    assert found.welded_mm == pytest.approx(16.0, abs=0.2)
+
+
 def test_without_arc_values_no_heat_is_stated() -> None:
     found = only(log(TWO_SPEEDS, WeldProcess()))
     assert found.arc_values == "unknown"
@@ -97,18 +105,18 @@ def test_a_hold_is_no_time_of_welding() -> None:
     assert only(record).arc_s == pytest.approx(2.0, rel=0.01)
 
 
-def test_pieces_of_a_seam_share_a_row() -> None:
+def test_pieces_of_a_pass_share_a_row() -> None:
     one = log([0.010] * 251)
-    table = {name: np.concatenate([one[name]] * 3) for name in one.columns}
+    table = {name: np.concatenate([one[name]] * 4) for name in one.columns}
     table["time_s"] = TICK_S * np.arange(len(table["time_s"]))
-    record = WeldRecord(table, np.concatenate([one.phase] * 3), MAG)
-    found = {number: rows.sum() for number, rows in seam_rows(record, [0, 0, 4])}
-    assert found == {0: 2 * len(one), 4: len(one)}
+    record = WeldRecord(table, np.concatenate([one.phase] * 4), MAG)
+    found = {number: rows.sum() for number, rows in seam_rows(record, [(0, 0), (0, 0), (0, 1), (4, 0)])}
+    assert found == {(0, 0): 2 * len(one), (0, 1): len(one), (4, 0): len(one)}
 
 
 def test_an_arc_that_never_burned_has_no_row() -> None:
     record = log([0.010] * 20, arc=[0.0] * 20)
-    assert welded_seam(record, 0, np.ones(len(record), dtype=bool)) is None
+    assert welded_seam(record, (0, 0), np.ones(len(record), dtype=bool)) is None
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,7 @@ def simulate(
     plan: SeamCurve | None = None,
     hidden_s: tuple[float, float] = (math.inf, math.inf),
     carrier: Carrier | None = None,
+    tacks: tuple[tuple[float, float, float], ...] = (),
 ) -> StudyRun:
     """One weld of a seam in a budget; everything random follows from the seed. The servo is the cell's own, unchanged.
 
@@ -145,7 +146,8 @@ def simulate(
 
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
-            the tag is not seen; carrier: what moves the tool from where it is; None: a robot that follows every
+            the tag is not seen; tacks: from, to and lift of the ball, m;
+            carrier: what moves the tool from where it is; None: a robot that follows every
             velocity.
 
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
@@ -158,7 +160,7 @@ def simulate(
     wedge = world.wedge
     line = wedge.seat_line(root)
     line = line.raised(world.seat_m) if world.seat_m else line
-    groove = Groove(line, gaps, roughness(root.length, budget, rng), budget.friction, wedge)
+    groove = Groove(line, gaps, roughness(root.length, budget, rng), budget.friction, wedge, tacks)
     wanted = root.raised(SEAT_M)
     torch_line = wanted.raised(settings.clearance_m) if settings.clearance_m else wanted
     reason: str | None = None

@@ -1,0 +1,83 @@
+"""Tacks: the tip is lifted over bumps of the true groove and finds it again, and the torch stays on the seam."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.groove import SEAT_M
+from weldcal.tools.worlds.weld.plant import StudyRun, simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, s_curve
+from weldcal.welding.passes.tacks import Tack, TackError, hops
+from weldcal.welding.record.process import PathError, path_error
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
+
+TACKS = ((0.050, 0.062, 2e-3), (0.125, 0.145, 5e-3), (0.215, 0.230, 3.5e-3))
+# the shape of a plan whose drawing was registered to a scan
+DRAWN = replace(NOMINAL, plan_warp_m=0.2e-3, plan_noise_m=0.05e-3)
+MM = 1e-3
+
+
+def welded(seed: int, known: bool = True) -> tuple[StudyRun, PathError, np.ndarray]:
+    """A run over three tacks, where the true torch was, and when it was on."""
+    config = ServoConfig(tacks=tuple(Tack(*t) for t in TACKS) if known else (), weld_speed_m_s=0.008)
+    run = simulate(TrueSeam("s", s_curve(), np.array([0.0, 0.0, 1.0])), DRAWN, config, seed, tacks=TACKS)
+    return run, path_error(run.points("torch"), run.torch_line), run.column("torch_on") > 0.5
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_torch_stays_on_the_seam_and_the_tip_finds_it_again(seed: int) -> None:
+    run, off, on = welded(seed)
+    assert run.phase == Phase.DONE, run.reason
+    assert np.ptp(off.s[on]) > 0.29
+    assert off.distance_m[on].max() < 0.3 * MM
+    phases = [a for a, b in pairwise([*(c.phase for c in run.commands), None]) if a != b]
+    assert phases[1:] == [*(Phase.TRACK, Phase.COAST) * 3, Phase.TRACK, Phase.FINISH, Phase.DONE]
+    # the ball hangs free above each tack, whose ends slope
+    tip = path_error(run.points("tip"), SeamCurve.from_points(s_curve()).raised(SEAT_M))
+    for a, b, lift in TACKS:
+        over = (tip.s > a) & (tip.s < b)
+        s = tip.s[over]
+        assert (tip.height[over] - np.minimum(lift, np.minimum(s - a, b - s))).min() > 0.3 * MM
+
+
+def test_an_unknown_tack_lifts_the_torch() -> None:
+    run, off, on = welded(0, known=False)
+    assert run.phase == Phase.FAULT or off.distance_m[on].max() > 1.5 * MM
+
+
+def test_near_tacks_are_passed_in_one_lift() -> None:
+    near = hops((Tack(0.1, 0.11, 4e-3), Tack(0.115, 0.125, 2e-3), Tack(0.25, 0.26, 2e-3)), 8e-3, 3e-3)
+    assert len(near) == 2
+    first = near[0]
+    assert (first.up, first.down) == pytest.approx((0.097, 0.128))
+    assert first.height == pytest.approx(5e-3)
+    for s in np.linspace(first.begin - 1e-3, first.end + 1e-3, 300):
+        height, slope = first.place(s, -3e-3, -0.5e-3)
+        h = 1e-7
+        if min(abs(s - edge) for edge in first[:4]) > h:
+            numeric = (first.place(s + h, -3e-3, -0.5e-3)[0] - first.place(s - h, -3e-3, -0.5e-3)[0]) / (2.0 * h)
+            assert slope == pytest.approx(numeric, abs=1e-5)
+        assert abs(slope) * 8e-3 <= 15e-3 + 1e-9
+        if first.up <= s <= first.down:
+            assert height == pytest.approx(5e-3)
+
+
+@pytest.mark.parametrize(
+    ("tack", "said"),
+    [
+        (Tack(0.010, 0.020, 3e-3), "tip comes down at 6 mm"),
+        (Tack(0.100, 0.110, 9e-3), "grind it"),
+        (Tack(0.110, 0.100, 3e-3), "end beyond the start"),
+        (Tack(0.100, 0.130, 5e-3), "100 mm the tip feels nothing for 65 mm, and the torch is 60 mm behind it"),
+    ],
+)
+def test_a_tack_that_cannot_be_passed_is_refused(tack: Tack, said: str) -> None:
+    with pytest.raises(TackError, match=said):
+        ServoConfig(tacks=(tack,))

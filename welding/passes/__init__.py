@@ -1,0 +1,1 @@
+"""Stitches, the passes after the root, and the beads that they lay."""
