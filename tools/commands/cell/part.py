@@ -49,7 +49,12 @@ def part(
         Path, option("--tool", "FILE", "Tool that has to fit the seams.", show_default="the shipped one")
     ] = WELDING,
     plan: Annotated[
-        int, option("--plan", "N", "Seams that the tool fits for which the arm's way is planned, the best first.")
+        int,
+        option(
+            "--plan",
+            "N",
+            "Seams that the tool fits for which the arm's way is planned, the best first, for about a minute.",
+        ),
     ] = MOST_PLANNED,
 ) -> Outcome:
     """List the seams and the edges of a part with their numbers, for workpiece.seams in a scenario, and draw them."""
@@ -76,10 +81,11 @@ def with_plans(
     found = [
         replace(seam, reason=reason, pieces=pieces, planned=True)
         for seam, (reason, pieces) in zip(
-            asked, planned(OwnPart(file, units=units), lines, tool, progress), strict=True
+            asked, planned(OwnPart(file, units=units), lines, tool, progress), strict=False
         )
     ]
-    return sorted([*found, *(seam for seam in seams if seam not in asked)], key=lambda seam: bool(seam.reason))
+    rest = [seam for seam in seams if seam not in asked[: len(found)]]
+    return sorted([*found, *rest], key=lambda seam: bool(seam.reason))
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:
