@@ -28,7 +28,7 @@ from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
 from weldcal.tools.commands.cell.part import edges_picture, with_plans
 from weldcal.tools.commands.cell.screen import Seam, ranked, ways
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, prism, write_step
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +184,21 @@ def test_the_edge_below_a_tube_is_left_out(tmp_path: Path) -> None:
     (_, _), (pieces, note), *_ = ways(shape, ring.edges)
     assert [seam.edges for seam in pieces] == [[id] for id in ring.edges if id != below]
     assert note == f"Without edges {below}, which are shorter than 20 mm or open downwards."
+
+
+def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    bevel = [(0, 0, 0), (0, 8, -8)]
+    plates = [
+        prism([*bevel, (0, 100, -8), (0, 100, 0)], (150, 0, 0)),
+        prism([*bevel, (0, 8, -80), (0, 0, -80)], (150, 0, 0)),
+    ]
+    write_step(assembly(*plates), tmp_path / "mitre.step")
+    words = ["part", str(tmp_path / "mitre.step"), "--plan", "0", "--out", str(tmp_path / "out")]
+    assert "a wider one cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
+    shape = read_shape(tmp_path / "mitre.step")
+    outside = next(edge.id for edge in shape.edges if np.abs(edge.points_P[:, 1:]).max() < 1e-9)
+    with pytest.raises(InputError, match=r"opens 270 deg, .* cannot be welded: weld its inside\."):
+        seam_of(shape, SeamSource(edges=(outside,)), "fillet")
 
 
 def test_after_a_minute_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:

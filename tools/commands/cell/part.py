@@ -23,7 +23,7 @@ from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.commands.cell.new import OwnPart, planned
-from weldcal.tools.commands.cell.screen import Seam, ranked, unit_hint
+from weldcal.tools.commands.cell.screen import Seam, outside_hint, ranked, unit_hint
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
 
@@ -141,7 +141,7 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         typer.echo(
             "No seams are listed: no two bodies meet within 3 mm in a concave joint, and no body has a concave edge."
         )
-    if hint := unit_hint(shape):
+    for hint in filter(None, (outside_hint(shape), unit_hint(shape))):
         typer.echo(hint)
     pick = "Pick by number in the scenario, workpiece.seams: [{edges: [ID, ...]}]. " if seams else ""
     typer.echo(f"{pick}Picture: {folder / 'report.html'}")

@@ -164,6 +164,14 @@ def unit_hint(shape: PartShape) -> str:
     return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
 
 
+def outside_hint(shape: PartShape) -> str:
+    """Return what a part asks whose corners are listed inside only, as those of a mitre; "" for any other."""
+    sides = [joint.side for joint in shape.joints if joint.type == "corner"]
+    if sides.count("inside") <= sides.count("outside"):
+        return ""
+    return "The outside of a corner is listed where it opens at most 180 deg; a wider one cannot be welded: weld its inside."
+
+
 def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
     """A seam along edges as a whole, and what it may be welded in: a ring in pieces that overlap, another edge by edge.
 
