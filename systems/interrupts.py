@@ -17,7 +17,9 @@ if TYPE_CHECKING:  # what is not loaded before the handlers are there cannot be 
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C or SIGTERM ended."""
-NOTHING_BEGUN = "The operator ended the command before it began its work. Nothing was written and nothing has moved."
+NOTHING_BEGUN = (
+    "Ctrl-C or SIGTERM ended the command before it began its work. Nothing was written and nothing has moved."
+)
 AGAIN_S = 0.01  # a choice: the destructor has returned by then, and the operator notices no delay
 SIGTERM = "SIGTERM"
 """Argument of the KeyboardInterrupt of that signal."""

@@ -48,15 +48,20 @@ def _of_a_reference(function: Callable[..., Any], owner: ref[Any]) -> Callable[.
     return call
 
 
-class _OfCpp(type(DrakeLeafSystem)):  # type: ignore[misc]
-    """Makes classes that keep the attributes of their objects where pybind11 keeps them."""
+def _metaclass() -> Any:
+    """Return a metaclass whose classes keep their objects' attributes where pybind11 keeps them.
 
-    @classmethod
-    def __prepare__(cls, name: str, bases: tuple[type, ...], /, **named: Any) -> dict[str, object]:
-        return {"__slots__": ()}
+    Drake for Python 3.12 and later is bound by nanobind, whose metaclass has no subclasses and needs none.
+    """
+    drakes: Any = type(DrakeLeafSystem)
+    if not drakes.__module__.startswith("pybind11"):
+        return drakes
+    return type(
+        "OfCpp", (drakes,), {"__prepare__": classmethod(lambda cls, name, bases, /, **named: {"__slots__": ()})}
+    )
 
 
-class LeafSystem(DrakeLeafSystem, metaclass=_OfCpp):
+class LeafSystem(DrakeLeafSystem, metaclass=_metaclass()):
     """A Drake LeafSystem that is freed with its Diagram.
 
     Two things keep others in memory for ever, with plants and renderers:

@@ -18,6 +18,7 @@ from weldcal.calibration.published.algorithm1 import Algorithm1State, Verificati
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.welding.locate.part.joint import FitUp
+from weldcal.welding.record.schedule import GapAlong
 from weldcal.welding.seam.curve import SeamCurve
 
 
@@ -265,6 +266,7 @@ class PlannedSeam(Message):
     arm_turn_rad: float = np.nan
     # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
     lean_rad: float = 0.0
+    gap: GapAlong | None = None  # along this plan, where the welding schedule follows it
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:

@@ -83,6 +83,10 @@ class Station:
         """Seconds of the Diagram per second of the wall clock; None: as fast as possible."""
         return self.robot.pace
 
+    def has(self, output: str) -> bool:
+        """Whether the station has an output port of this name."""
+        return bool(self.diagram.HasOutputPort(output))
+
     def waiting_s(self, now: float) -> float:
         """Seconds for which the newest background computation has been waited for at `now` (s, monotonic)."""
         since = self.background.waiting_since

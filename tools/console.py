@@ -235,7 +235,7 @@ def _ended(problem: BaseException) -> str:
     """Return the sentence of a command that a signal ended; it names the folder whose result is not complete."""
     folders = getattr(problem, "__notes__", ())
     begun = f"The result in '{folders[0]}' is not complete (UNFINISHED): run the command again." if folders else ""
-    return f"The operator ended the command. {begun or 'It leaves no incomplete result.'}"
+    return f"Ctrl-C or SIGTERM ended the command. {begun or 'It leaves no incomplete result.'}"
 
 
 SHARE_TOLD = 0.1

@@ -15,6 +15,7 @@ from weldcal.calibration.eye_on_base.validation import position_errors, tilt_err
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import chi2_share
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -96,6 +97,26 @@ def estimate_jointly(
         sigma_normal_rad=found.sigma_normal_rad if applied else rigid.sigma_normal_rad,
     )
     return estimate, _verdict(fit, len(good), rigid, estimate)
+
+
+def left_uncorrected(rigid: CalibrationEstimate, asked: CalibrationEstimate) -> CalibrationEstimate:
+    """Return the rigid estimate with the covariance of a scanner that stays uncorrected.
+
+    ``asked`` is the joint estimate from the same poses (``estimate_jointly``). To its covariance comes the square of
+    what its correction would change: as far as that is right, the rigid estimate errs by it.
+    """
+    if asked.scanner is None or asked.joint is None:
+        return rigid
+    none = replace(ScannerCorrection.unchanged(len(asked.scanner.values)), field_m=asked.scanner.field_m)
+    change = np.concatenate(
+        [
+            rotation_vector(asked.X_BC.rotation() @ rigid.X_BC.rotation().inverse()),
+            asked.X_BC.translation() - rigid.X_BC.translation(),
+            asked.scanner.values - none.values,
+        ]
+    )
+    joint = asked.joint + np.outer(change, change)
+    return replace(rigid, scanner=none, joint=joint, covariance=joint[:6, :6])
 
 
 def solve_jointly(

@@ -13,8 +13,12 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
+from weldcal.welding.record.schedule import WeldSchedule
 
-DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe")
+DEVICES = (
+    *("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe"),
+    "power_source",
+)
 """The devices of a station, by their key in the scenario; drivers are applied in this order."""
 
 
@@ -43,8 +47,16 @@ class DriverConfig:
 
     @property
     def reports_arc(self) -> bool:
-        """Whether a robot's driver reports the arc of its power source."""
+        """Whether a driver of a robot or of a power source reports the arc."""
         return False
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """The set values of the power source that the driver passes on: names of schedule.VALUES, and job."""
+        return ()
+
+    def check_schedule(self, schedule: WeldSchedule) -> None:
+        """Check that the driver can set each value of a schedule that it takes. Raises InputError."""
 
     def torch_delay_s(self) -> float:
         """Time from the command of the torch to the torch, s, such as for the shielding gas."""

@@ -304,8 +304,9 @@ class Spine:
         )
         process = self.switch.GetOutputPort("process_on")
         w.builder.ExportOutput(process, "process_on")
-        if w.station.diagram.HasInputPort(f"{FIRST}.process_on"):
-            w.feed(f"{FIRST}.process_on", process)
+        for port in (f"{FIRST}.process_on", "power_source.process_on"):
+            if w.station.diagram.HasInputPort(port):
+                w.feed(port, process)
 
 
 def add_spine(

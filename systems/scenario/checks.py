@@ -19,6 +19,8 @@ from weldcal.systems.drivers.config import NoDevice, check_range
 from weldcal.systems.jobs.job import job_of, jobs
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
+from weldcal.welding.locate.part.joint import SHOWN_BY
+from weldcal.welding.record.schedule import VALUES
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
@@ -238,6 +240,35 @@ def check_refinement(scenario: Scenario) -> None:
         )
 
 
+def check_schedule(scenario: Scenario) -> None:
+    """Check the welding schedule.
+
+    Raises:
+        InputError: an invalid value, or a table by gap for a seam whose gap is not measured.
+    """
+    schedule, spec = scenario.welding.schedule, scenario.workpiece
+    if scenario.robot.reports_arc and scenario.power_source.reports_arc:
+        raise InputError("robot.arc_input and power_source both report the arc: leave out robot.arc_input.")
+    if schedule is None:
+        return
+    schedule.check(scenario.welding.arc.crater_s)
+    taken = {*scenario.power_source.takes, *scenario.robot.takes}
+    wanted = [name for name in VALUES if schedule.extremes(name)] + ["job"] * (schedule.job is not None)
+    if missing := [name for name in wanted if name not in taken]:
+        raise InputError(
+            f"welding.schedule sets {missing[0]}, and nothing passes it on: write power_source with a register for it,"
+            " or wire robot.wire_feed and robot.arc_voltage."
+        )
+    for driver in (scenario.power_source, scenario.robot):
+        driver.check_schedule(schedule)
+    measured = spec is not None and spec.file is not None and spec.located_by == "scan"
+    if schedule.by_gap and not (measured and spec is not None and "gap" in SHOWN_BY.get(spec.joint or "", ())):
+        raise InputError(
+            "welding.schedule.by_gap needs a joint whose gap is measured in the scan: a butt, fillet or lap of a part"
+            " from a file (workpiece.file, located_by: scan)."
+        )
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -266,7 +297,8 @@ def check_scenario(scenario: Scenario) -> None:
         )
     scenario.welding.process.process()
     scenario.welding.order.check()
-    scenario.welding.arc.check(scenario.robot.reports_arc)
+    scenario.welding.arc.check(scenario.reports_arc)
+    check_schedule(scenario)
     weave = scenario.welding.weave
     if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
         raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")

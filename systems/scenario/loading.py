@@ -121,7 +121,7 @@ def _read(name: str, before: tuple[Path, ...]) -> Scenario:
         listed = f"choose one of {', '.join(scenario_names())} or give a YAML file."
         raise InputError(f"{asked}: {did_you_mean(name, scenario_names(), listed)}")
     if path.resolve() in before:
-        raise InputError(f"{before[0].name} extends itself by way of {path.name}: remove one `extends`.")
+        raise InputError(f"{before[0].name} extends itself through {path.name}: remove one `extends`.")
     text = read_text(path, LARGEST_DOCUMENT)
     document = parse_document(path.name, text) if text.strip() else None  # within bounds, no key twice
     base = document.get("extends") if isinstance(document, dict) else None

@@ -17,6 +17,7 @@ from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
@@ -223,6 +224,7 @@ class WeldingConfig:
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
+    schedule: WeldSchedule | None = None  # null: no set values; the power source is set by hand
     order: WeldOrder = dc.field(default_factory=WeldOrder)
     weave: WeaveOrder | None = None  # null: a stringer bead
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
@@ -287,6 +289,7 @@ class Scenario:
     digitizer: DriverConfig = dc.field(default_factory=NoDevice)
     profiler: DriverConfig = dc.field(default_factory=NoDevice)
     touch_probe: DriverConfig = dc.field(default_factory=NoDevice)
+    power_source: DriverConfig = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
@@ -304,6 +307,11 @@ class Scenario:
     def table_height_m(self) -> float:
         """Height of the table over the base's origin, against gravity, m."""
         return self.calibration.table_z_m - self.base.xyz_m[2]
+
+    @property
+    def reports_arc(self) -> bool:
+        """Whether robot or power source report the arc."""
+        return self.robot.reports_arc or self.power_source.reports_arc
 
     @property
     def welds(self) -> bool:

@@ -238,7 +238,7 @@ def test_ctrl_c_ends_with_130_and_one_sentence(capsys: pytest.CaptureFixture[str
         raise KeyboardInterrupt
     assert end.value.exit_code == 130
     said = capsys.readouterr()
-    assert said.err.startswith("weldcal: The operator ended the command.")
+    assert said.err.startswith("weldcal: Ctrl-C or SIGTERM ended the command.")
     assert len(said.err.splitlines()) == 1
     assert json.loads(said.out)["state"] == "failed"
 

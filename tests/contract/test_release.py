@@ -128,8 +128,8 @@ def test_notice_lists_the_packages_of_the_lock() -> None:
 
 def stated(about: Message) -> str:
     """The licence that a package states itself; empty where it does so in free words only."""
-    if about["License-Expression"]:
-        return str(about["License-Expression"])
+    if about.get("License-Expression"):
+        return str(about.get("License-Expression"))
     classifiers = [
         text.rpartition(" :: ")[2] for text in about.get_all("Classifier") or [] if text.startswith("License")
     ]

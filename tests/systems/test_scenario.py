@@ -114,6 +114,13 @@ touch_probe: !UrTouchProbe
   input: 3
   normally_closed: true
   latency_s: 0.002
+power_source: !SimulatedPowerSource
+  current_A: 150.0
+  voltage_V: 22.0
+  ignition_s: 0.2
+  response_s: 0.1
+  stick_out_mm: 18.0
+  noise: 0.01
 profiler: !RenderedProfiler
   xyz_m: [0.08, 0.01, 0.05]
   rpy_deg: [1.0, 0.0, 80.0]
@@ -229,6 +236,14 @@ welding:
   seam_length_mm: 100.0
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
   arc: {start: rest, start_s: 0.4, crater_s: 0.6}
+  schedule:
+    job: 3
+    wire_feed_m_min: 8.0
+    voltage_V: 24.0
+    current_A: 200.0
+    hot_start: {wire_feed_m_min: 9.0, voltage_V: 25.0, current_A: 210.0, time_s: 0.4, ramp_s: 0.3}
+    crater: {wire_feed_m_min: 5.0, voltage_V: 20.0, current_A: 120.0, ramp_s: 0.4}
+    by_gap: [{gap_mm: 0.5, wire_feed_m_min: 8.0, voltage_V: 24.0, current_A: 200.0, speed_mm_s: 7.0}]
   order: {order: o, wps: w, wpqr: q, drawing: d, part: p, serial: s, batch: b, operator: x, material: m, filler: f,
     filler_batch: fb, gas: g, position: PA, note: n, limits: {heat_input_kJ_mm: [0.5, 1.0], speed_mm_s: [7.0, 9.0],
     current_A: [80.0, 100.0], voltage_V: [10.0, 12.0], path_mm: 0.4}}
@@ -593,7 +608,7 @@ def test_a_file_named_in_a_base_is_looked_for_beside_the_base(tmp_path: Path) ->
     ("text", "named"),
     [
         ("extends: nowhere\n", "mine.yaml extends 'nowhere', which does not exist: choose one of"),
-        ("extends: mine.yaml\n", "mine.yaml extends itself by way of mine.yaml"),
+        ("extends: mine.yaml\n", "mine.yaml extends itself through mine.yaml"),
     ],
 )
 def test_a_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, named: str) -> None:

@@ -212,5 +212,5 @@ def test_touches_that_say_nothing_are_refused() -> None:
         calibrate_tip(pressed[:3], shown[:3])
     with pytest.raises(InputError, match="differ by less than half a millimetre"):
         calibrate_tip(0.1 * pressed, 0.1 * shown)
-    with pytest.raises(InputError, match="the tip slipped, the plate gave way"):
+    with pytest.raises(InputError, match="the tip slipped, the plate yielded"):
         calibrate_tip(pressed, 0.5 * shown)

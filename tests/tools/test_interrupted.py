@@ -63,7 +63,7 @@ def test_a_signal_while_python_runs_a_text_keeps_the_exit_code(tmp_path: Path) -
 def test_before_the_work_begins_nothing_was_written(number: str) -> None:
     ended = python(f"os.kill(os.getpid(), signal.{number}); print('goes on')", "--json")
     assert ended.returncode == 130
-    assert ended.stderr.startswith("weldcal: The operator ended the command before it began")
+    assert ended.stderr.startswith("weldcal: Ctrl-C or SIGTERM ended the command before it began")
     assert json.loads(ended.stdout)["state"] == "failed"
 
 

@@ -107,6 +107,13 @@ class CommandGroup(TyperGroup):
         if args and args[0] in self.commands:
             with console.boundary(json_wanted="--json" in args, debug="--debug" in args):
                 self.commands[args[0]]
+        elif args and not args[0].startswith("-") and not ctx.resilient_parsing:
+            from weldcal.models.documents import nearest  # only here: an import of 80 ms
+
+            entries = self.commands.entries  # type: ignore[attr-defined]
+            shown = [name for name in self.commands if name not in entries or not entries[name].hidden]
+            near = nearest(args[0], shown)
+            ctx.fail(f"No such command '{args[0]}'." + (f" Did you mean '{near}'?" if near else ""))
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: Any) -> list[str]:

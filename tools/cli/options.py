@@ -1,6 +1,7 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
 import inspect
+import logging
 import os
 import sys
 import tempfile
@@ -256,6 +257,9 @@ def command(
     def decorate(body: Body) -> CliCommand:
         def run(**given: Any) -> None:
             _check_numbers(given)
+            # A signal in Python's logging below Drake's would be lost: C++ takes the exception. Set after the import,
+            # the level holds in C++ (pydrake.common, _sync_spdlog_level), and Drake's notes never come to Python.
+            logging.getLogger("drake").setLevel(logging.WARNING)
             shared = {name: given.pop(name) for name in names}
             json, debug = shared.get("json", False), shared["debug"]
             with ExitStack() as pages:

@@ -20,8 +20,9 @@ from weldcal.calibration.data.results import CalibrationResult, IcpRecord, expor
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
-from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
+from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
@@ -295,7 +296,10 @@ def calibrate_dataset(
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
     if correct_scanner and not confirmed and not few:
-        warnings += _unconfirmed(inliers, seed)
+        asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
+        warnings += _unconfirmed(asked, verdict)
+        if refined is None:
+            estimate = left_uncorrected(estimate, asked)
     correction = None if found.correction is None else found.correction.document()
     values = {
         "residual_mm": 1e3 * estimate.position_residuals_m,
@@ -392,12 +396,11 @@ def _refinement(
     return replace(steps, refine=kind, arm=arm, joints=q, note=note)
 
 
-def _unconfirmed(inliers: list[Observation], seed: int) -> list[str]:
+def _unconfirmed(asked: CalibrationEstimate, verdict: ScannerVerdict | None) -> list[str]:
     """Name the scanner correction that the robot's motion alone asks for, in a sentence.
 
     Many programs could not apply it, and without it X_BC would be off by what it takes over.
     """
-    asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
     if verdict is None or verdict.accepted is None:
         return []
     left = 1e3 * float(np.nanmean(asked.held_out.position_m))

@@ -71,7 +71,7 @@ def _print_all(robots: list[Robot]) -> None:
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 1, 0, 0))
-    for k, heading in enumerate(("name", "flange", "dowel", "kg", "reach m", "± mm", "axes", "inverse")):
+    for k, heading in enumerate(("name", "flange", "dowel", "kg", "reach m", "repeat mm", "axes", "inverse")):
         table.add_column(heading, justify="right" if 2 <= k <= 6 else "left", no_wrap=True)
     for r in robots:
         repeatability = "-" if r.repeatability_m is None else f"{1e3 * r.repeatability_m:g}"
@@ -81,7 +81,11 @@ def _print_all(robots: list[Robot]) -> None:
         )
     screen = Console()
     screen.print(table)
-    screen.print("-: not in a public source. dowel: degrees about the tool's z, from x.", highlight=False)
+    screen.print(
+        "-: not in a public source. dowel: degrees about the tool's z, from x. repeat: repeatability, plus or minus."
+        " inverse: how the inverse kinematics is solved.",
+        highlight=False,
+    )
     screen.print(
         "weldcal robots NAME shows one robot, joint by joint, with the source of each number.", highlight=False
     )

@@ -75,6 +75,7 @@ class WeldLog:
     deflection_T: Array
     sigma_min: Array
     arc: Array | None = None  # (N, 3) arc reported 1 or 0, current A, voltage V of the power source; NaN where none
+    scheduled: Array | None = None  # (N, 5) as SET_VALUES of the schedule, then the gap m; NaN where none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,6 +205,7 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"][0, keep]),
         arc=np.vstack([series.get("arc", missing), series.get("arc_values", missing.repeat(2, axis=0))])[:, keep].T,
+        scheduled=np.vstack([series["set_values"], series["gap"]])[:, keep].T if "set_values" in series else None,
     )
 
 

@@ -1,4 +1,4 @@
-"""Write the record of a welded part: record.json, record.csv, pictures of each seam, and the report's section."""
+"""Write the record of a welded part: record.html, record.json, record.csv, pictures, and the report's section."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,9 +13,10 @@ from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.runner import Run
 from weldcal.tools.report.files import mappings_csv, write_json
-from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.report.plots_record import arc_over_time
+from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams
-from weldcal.welding.record.order import RANGES, WeldOrder
+from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import WeldRecord
 from weldcal.welding.record.welded_seam import (
@@ -31,7 +32,7 @@ from weldcal.welding.record.welded_seam import (
 )
 from weldcal.welding.servo.state import Phase
 
-RECORD_JSON, RECORD_CSV, PICTURES = "record.json", "record.csv", "pictures"
+RECORD_HTML, RECORD_JSON, RECORD_CSV, PICTURES = "record.html", "record.json", "record.csv", "pictures"
 PHASE_NAMES = [str(phase) for phase in Phase]
 ENDS = ("start", "end")
 _PICTURE_KEYS = tuple(f"picture_{end}" for end in ENDS)
@@ -57,12 +58,14 @@ class PartRecord:
     log: WeldRecord
     seams: tuple[WeldedSeam, ...]
     pictures: dict[str, bytes]
+    plots: dict[int, bytes]  # of the arc, by the seam's number from 1
 
     @property
     def outside(self) -> list[str]:
         """A sentence for each limit that a seam exceeds."""
         return [
-            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {seam.seam}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
+            f" {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -73,14 +76,17 @@ class PartRecord:
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
+        return [(str(seam.seam), *row) for seam in self.seams for row in self.rows_of(seam)]
+
+    def rows_of(self, seam: WeldedSeam) -> list[tuple[str, ...]]:
+        """The same rows of one seam, without its number."""
         found: list[tuple[str, ...]] = []
-        for seam in self.seams:
-            outside = seam.outside(self.order.limits)
-            for name, (words, unit, digits) in _WORDS.items():
-                limit = _limit(self.order, name)
-                verdict = "" if limit == "–" else "outside" if name in outside else "within"
-                mean = fixed(_spread(seam, name).mean, digits)
-                found.append((str(seam.seam), f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+        outside = seam.outside(self.order.limits)
+        for name, (words, unit, digits) in _WORDS.items():
+            limit = _limit(self.order, name)
+            verdict = "" if limit == "–" else "outside" if name in outside else "within"
+            mean = fixed(_spread(seam, name).mean, digits)
+            found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -90,8 +96,10 @@ class PartRecord:
         if process.missing is None:
             name, k = process.name or "not named", process.k
             found.append(("process", f"{name}, {process.current_A:g} A, {process.voltage_V:g} V as set; k = {k:g}"))
-        elif MEASURED not in sources:
+        elif UNKNOWN in sources or not sources:
             return [*found, ("heat input", f"not known: {process.missing}")]
+        else:
+            found.append(("process", f"{process.name or 'not named'}; k = {fixed(process.k, 2)}"))
         return [*found, ("arc values", "; ".join(_SOURCES[source] for source in sorted(sources)))]
 
     def write(self, folder: Path) -> None:
@@ -118,12 +126,51 @@ class PartRecord:
             "order": self.order.document(),
             "outside_limits": self.outside,
             "process": asdict(self.log.process),
+            "schedule": self.log.settings.get("schedule"),
             "seams": [
                 asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
                 for seam, row in zip(self.seams, rows, strict=True)
             ],
         }
         write_json(folder / RECORD_JSON, document)
+        write_atomic(folder / RECORD_HTML, self.page(written))
+
+    def _ends_of(self, seam: int) -> bytes | None:
+        """The pictures of a seam's start and end side by side, PNG; None without them."""
+        names = [f"seam_{seam}_{end}" for end in ENDS]
+        grey = [cv2.imdecode(np.frombuffer(self.pictures[n], np.uint8), 0) for n in names if n in self.pictures]
+        found = [np.pad(one, ((0, 0), (0, 8)), constant_values=255) for one in grey if one is not None]
+        tall = max((len(one) for one in found), default=0)
+        row = [np.pad(one, ((0, tall - len(one)), (0, 0)), constant_values=255) for one in found]
+        return cv2.imencode(".png", np.hstack(row))[1].tobytes() if row else None
+
+    def page(self, written: str) -> str:
+        """The record as one self-contained HTML text."""
+        ended, seams = str(self.log.settings.get("ended", "")), len(self.seams)
+        limited, what = self.order.limits != OrderLimits(), f"{seams} seam{'' if seams == 1 else 's'} welded"
+        tone, headline = ("good", f"{what}, within all limits") if limited else ("plain", f"{what}, no limits ordered")
+        if self.outside:
+            tone, headline = "bad", f"{what}, {len(self.outside)} of the limits exceeded"
+        if ended not in ("", "done") or not seams:
+            tone, headline = "bad", f"{what}; the job was held"
+        cards = [
+            (f"Seam {seam.seam}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
+            for seam in self.seams
+            for words in [f"{seam.welded_mm:.0f} mm in {seam.arc_s:.1f} s; arc values {_SOURCES[seam.arc_values]}"]
+        ]
+        return render(
+            "weld_record.html.j2",
+            record=self,
+            order=self.order,
+            plots=self.plots,
+            pictures={seam.seam: picture for seam in self.seams if (picture := self._ends_of(seam.seam)) is not None},
+            cards=cards,
+            written=written.replace("T", " ").replace("+00:00", " UTC"),
+            simulated=self.log.settings.get("robot") == "simulated",
+            tone=tone,
+            headline=headline,
+            sentence=ended if tone == "bad" and ended not in ("", "done") else "",
+        )
 
 
 def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
@@ -149,6 +196,10 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
     arc = np.full((len(log.time), 3), np.nan) if log.arc is None else log.arc
     table |= {name: arc[:, k] for k, name in enumerate(("arc", "current_A", "voltage_V"))}
+    scheduled = np.full((len(log.time), 5), np.nan) if log.scheduled is None else log.scheduled
+    names = ("set_wire_feed_m_min", "set_voltage_V", "set_current_A", "gap_m")
+    table |= {name: scheduled[:, k] for k, name in enumerate(names, start=1)}
+    known = np.where(np.isfinite(arc[:, 1:]), arc[:, 1:], scheduled[:, [3, 2]])  # current and voltage
     table |= {
         "torch_speed_m_s": speed,
         "torch_speed_commanded_m_s": named["torch_speed"],
@@ -156,7 +207,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_rad_s": named["omega"],
         "work_angle_rad": np.where(moving, work, np.nan),
         "travel_angle_rad": np.where(moving, travel, np.nan),
-        "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan), arc[:, 1], arc[:, 2]),
+        "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan), known[:, 0], known[:, 1]),
     }
     settings = {
         "software": software_version(),
@@ -174,6 +225,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "felt": felt_seams(run),
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
+        "schedule": None if cell.scenario.welding.schedule is None else asdict(cell.scenario.welding.schedule),
     }
     phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)
     return WeldRecord(table, phase, process, settings)
@@ -182,7 +234,9 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
 def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
     """The record of a finished run from its weld log; without a seam where no arc burned."""
     numbers: Sequence[int] = [plan.seam for plan in run.cell.job.planned_seam(run.root).records]
-    seams = [welded_seam(log, number, rows) for number, rows in seam_rows(log, numbers)]
+    order, of_seam = run.cell.scenario.welding.order, list(seam_rows(log, numbers))
+    seams = [welded_seam(log, number, rows) for number, rows in of_seam]
+    plots = {number + 1: arc_over_time(log, rows, order.limits) for number, rows in of_seam}
     pictures = {
         f"seam_{seam + 1}_{end}": cv2.imencode(".png", image.pixels)[1].tobytes()
         for seam, images in run.seam_pictures.items()
@@ -190,10 +244,11 @@ def part_record(run: Run[WeldJob], log: WeldRecord) -> PartRecord:
         if image.pixels.size
     }
     return PartRecord(
-        order=run.cell.scenario.welding.order,
+        order=order,
         log=log,
         seams=tuple(seam for seam in seams if seam is not None),
         pictures=pictures,
+        plots={number: plot for number, plot in plots.items() if plot is not None},
     )
 
 

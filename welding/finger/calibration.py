@@ -106,8 +106,8 @@ def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, i
     tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
     if np.sort(tilts)[-3:].min() < LEAST_TILT_DEG:
         raise InputError(
-            f"The board is turned by at most {tilts.max():.0f} degrees: tilt it by 20 to 40 degrees to all sides, or"
-            " its distance and the focal length cannot be told apart."
+            f"The board is turned by at most {tilts.max():.0f} degrees: tilt it by 20 to 40 degrees to all sides."
+            " Otherwise its distance and the focal length cannot be separated."
         )
     if rms > WORST_PX:
         raise InputError(
@@ -161,7 +161,7 @@ def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = Non
     scale, R, seat = _similar(pressed, shown, turned)
     if abs(scale - 1.0) > FAR_OFF:
         raise InputError(
-            f"The tag shows {scale:.2f} times the robot's displacement: the tip slipped, the plate gave way, or the tag"
+            f"The tag shows {scale:.2f} times the robot's displacement: the tip slipped, the plate yielded, or the tag"
             " is another one."
         )
     left = []

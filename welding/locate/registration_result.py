@@ -102,8 +102,7 @@ def agreement(
         )
     if supported < config.min_supported:
         raise not_found(
-            workpiece,
-            f"only {100 * supported:.0f} % of its outline can be seen; clear the view or scan from higher up.",
+            workpiece, f"only {100 * supported:.0f} % of its outline is visible; clear the view or scan from higher up."
         )
     return supported, contradicted
 
@@ -121,6 +120,6 @@ def known_well_enough(
         raise WorkpieceNotFound(
             f"The plate was found, but its position is only known to {1e3 * uncertain:.2f} mm from this scan (noise"
             f" {1e3 * noise:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are"
-            " required: use a finer scanner or move it nearer."
+            " required. Use a finer scanner or move it nearer."
         )
     return uncertain

@@ -84,8 +84,15 @@ COLUMNS: tuple[LogColumn, ...] = (
     LogColumn("arc", "", "", "1: the power source reports an arc, 0: none; nan where its signal is not wired"),
     LogColumn("current_A", "A", "", "welding current as the power source measures it; nan where it gives none"),
     LogColumn("voltage_V", "V", "", "arc voltage as the power source measures it; nan where it gives none"),
+    LogColumn("set_wire_feed_m_min", "m/min", "", "wire feed that the schedule sets; nan where it sets none"),
+    LogColumn("set_voltage_V", "V", "", "voltage that the schedule sets; nan where it sets none"),
+    LogColumn("set_current_A", "A", "", "current that the schedule sets; nan where it sets none"),
+    LogColumn("gap_m", "m", "planned seam", "measured gap that the schedule follows; nan where it follows none"),
 )
-_LATER = ("arc", "current_A", "voltage_V")  # columns that logs of before do not have
+_LATER = (
+    *("arc", "current_A", "voltage_V"),
+    *("set_wire_feed_m_min", "set_voltage_V", "set_current_A", "gap_m"),
+)  # columns that logs of before do not have
 NAMES = tuple(c.name for c in COLUMNS)
 _NUMBERS = tuple(name for name in NAMES if name != "phase")
 
@@ -245,9 +252,12 @@ def _header(text: str, path: Path) -> dict[str, Any]:
 
 
 def heat_summary(record: WeldRecord) -> tuple[float, float] | None:
-    """Mean and largest heat input in kJ/mm over the weld, by time; None where it is not known."""
+    """Heat input in kJ/mm of the whole weld, and its largest value; None where it is not known."""
     heat = record["heat_input_J_m"][record.torch_on]
+    speed = np.abs(record["torch_speed_m_s"][record.torch_on])
+    known = np.isfinite(heat) & np.isfinite(speed)
     good = heat[np.isfinite(heat)]
-    if not len(good):
+    if not len(good) or not speed[known].any():
         return None
-    return 1e-6 * float(good.mean()), 1e-6 * float(good.max()) if len(good) == len(heat) else math.inf
+    mean = float((heat[known] * speed[known]).sum() / speed[known].sum())  # energy over length: a stand counts too
+    return 1e-6 * mean, 1e-6 * float(good.max()) if len(good) == len(heat) else math.inf

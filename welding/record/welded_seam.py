@@ -106,13 +106,14 @@ def welded_seam(record: WeldRecord, number: int, rows: NDArray[np.bool_]) -> Wel
 def arc_values(record: WeldRecord, rows: NDArray[np.intp]) -> tuple[Array, Array, str]:
     """Current A and voltage V of these rows, and whether they are measured, set or unknown.
 
-    A row without a measurement has the mean of those with one.
+    A row without a measurement has the mean of those with one. What the schedule sets counts before the process.
     """
-    measured = record["current_A"][rows], record["voltage_V"][rows]
-    good = np.isfinite(measured[0]) & np.isfinite(measured[1])
-    if good.any():
-        current, voltage = (np.where(good, values, values[good].mean()) for values in measured)
-        return current, voltage, MEASURED
+    for prefix, source in (("", MEASURED), ("set_", SET)):
+        pair = record[f"{prefix}current_A"][rows], record[f"{prefix}voltage_V"][rows]
+        good = np.isfinite(pair[0]) & np.isfinite(pair[1])
+        if good.any():
+            current, voltage = (np.where(good, values, values[good].mean()) for values in pair)
+            return current, voltage, source
     process = record.process
     known = process.current_A is not None and process.voltage_V is not None
     current, voltage = (

@@ -77,7 +77,7 @@ def check_clearance(
             if near < CLEARANCE_M:
                 raise NoClearance(
                     f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body"
-                    f" would come within {1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer"
+                    f" would come within {1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm). Use a longer"
                     " finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
                 )
@@ -198,7 +198,7 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             by_length = name == "end" and seam.end is not None
             change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
             raise NoClearance(
-                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs"
+                f"The part crosses the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs"
                 f" {1e3 * needed:.0f} mm there: set {change}, or weld it from elsewhere.",
                 needed - free,
             )

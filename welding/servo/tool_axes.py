@@ -152,7 +152,7 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
         raise InfeasibleSeam(
             f"Plan infeasible: the torch's travel angle would be {math.degrees(travel[k]):.0f} deg at"
             f" {1e3 * path.s_torch[k]:.0f} mm of the seam, and its window is {math.degrees(windows.travel_rad):.0f}"
-            " deg; take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
+            " deg. Take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
         )
 
 

@@ -98,9 +98,8 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     middle = float(np.median(z))
     if not 0.0 < middle <= FAR * far_m:
         raise Garbage(
-            f"the middle of the cloud is {middle:.3g} m away, but the scanner's range is {far_m:.3g} m: set"
-            " scanner.unit"
-            " to the unit of its points, and send them in the camera frame"
+            f"the middle of the cloud is {middle:.3g} m away, but the scanner's range is {far_m:.3g} m. Set"
+            " scanner.unit to the unit of its points, and send them in the camera frame"
         )
     return cloud
 

@@ -149,17 +149,18 @@ class UrLink:
         link._end()
         raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" Its output: {said}" if said else ""))
 
-    def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
-        """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number.
+    def command(self, qd: NDArray[np.float64], process: bool = False, shares: NDArray[np.float64] | None = None) -> int:
+        """Pass a joint velocity (6,) rad/s, the process enable, and shares as in Given; returns the command's number.
 
         Never blocks.
         """
-        self._give(qd, process=process)
+        more: dict[str, Any] = {} if shares is None else {"shares": shares}
+        self._give(qd, process=process, **more)
         return self._number
 
-    def _give(self, qd: NDArray[np.float64], *, stop: bool = False, process: bool = False) -> None:
+    def _give(self, qd: NDArray[np.float64], *, stop: bool = False, process: bool = False, **more: Any) -> None:
         self._number += 1
-        command = Given(number=self._number, host_time=time.monotonic(), stop=stop, process=process, qd=qd)
+        command = Given(number=self._number, host_time=time.monotonic(), stop=stop, process=process, qd=qd, **more)
         self._memory.command.write(command)
 
     def rest(self) -> None:

@@ -273,11 +273,11 @@ class ControllerStream:
         """Give a command that the guard answers once; returns whether it did."""
         return self._stream.once(time.monotonic() + ANSWER_LIMIT_S / self._pace, command, *arguments)
 
-    def _write(self, command: int, *arguments: float, armed: bool = False) -> None:
+    def _write(self, command: int, *arguments: float, armed: bool = False, shares: np.ndarray | None = None) -> None:
         """Write a command; `armed`: with the set points of the power source."""
         points = [0.0] * (self._doubles - DOUBLES)
         for level in self._levels if armed else ():
-            points[level.output] = level.share
+            points[level.output] = level.wanted(shares)
         self._stream.send(command, *arguments, *points)
 
     def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
@@ -370,10 +370,18 @@ class ControllerStream:
             self._sent = {number: t for number, t in self._sent.items() if t > self._sent[echo]}
             self._first_unheard = min(self._sent.values(), default=now)
 
-    def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
+    def send(
+        self,
+        qd: np.ndarray,
+        acceleration: float,
+        process: bool = False,
+        armed: bool = False,
+        shares: np.ndarray | None = None,
+    ) -> bool:
         """Send one velocity, numbered for the guard's watchdog.
 
-        A negative number enables the process, `armed` the set points. Returns False where the program does not run.
+        A negative number enables the process, `armed` the set points, `shares` (2,) as in Given. Returns False where
+        the program does not run.
         """
         self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()
@@ -383,7 +391,7 @@ class ControllerStream:
         if not self._playing:
             self.forget()
             return False
-        self._write(VELOCITY, *qd.tolist(), acceleration, self._number, armed=armed)
+        self._write(VELOCITY, *qd.tolist(), acceleration, self._number, armed=armed, shares=shares)
         return True
 
     def torch_off(self) -> None:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses as dc
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, ClassVar
 
@@ -29,6 +29,7 @@ from weldcal.systems.drivers.ur.wire.line import stop_program
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
+from weldcal.welding.record.schedule import WeldSchedule
 
 FULL_PACE = 1.0  # a controller's time is real time; only an emulated one has another pace
 STILL_RAD_S = 1e-9  # rounding of a zero command: in a frame of 2 ms a joint turns 2e-12 rad
@@ -97,6 +98,19 @@ class UrRtde(DriverConfig):
         return points_s + (0.0 if self.gas_output is None else self.gas_before_s)
 
     @property
+    def takes(self) -> tuple[str, ...]:
+        """See DriverConfig."""
+        wired = {"wire_feed_m_min": self.wire_feed, "voltage_V": self.arc_voltage}
+        return tuple(name for name, point in wired.items() if point is not None)
+
+    def check_schedule(self, schedule: WeldSchedule) -> None:
+        """See DriverConfig."""
+        for key, name in (("wire_feed", "wire_feed_m_min"), ("arc_voltage", "voltage_V")):
+            point = getattr(self, key)
+            for value in schedule.extremes(name) if point is not None else ():
+                dc.replace(point, value=value).level(key)
+
+    @property
     def set_points(self) -> bool:
         """Whether the power source's set points are wired to analog outputs."""
         return self.wire_feed is not None or self.arc_voltage is not None
@@ -115,6 +129,7 @@ class UrRtdeArm(LeafSystem):
         input_ports:
         - velocity_command
         - process_on
+        - set_values
         output_ports:
         - desired_state
         - position_measured
@@ -130,17 +145,27 @@ class UrRtdeArm(LeafSystem):
     simulated arm follows. Outputs depend on the state only: no feedthrough. On a computer that is late the clock's
     `rate` is below 1: velocities are sent, and read, in proportion to it. `arc_established` (1): 1 while the power
     source reports an arc, or where its input is not wired. `process_on` (1) switches the torch's digital output, where
-    one is wired; unconnected means off.
+    one is wired; unconnected means off. `set_values` (4; unconnected: the scenario's) are those of the power source; a
+    number that is NaN is the scenario's.
     """
 
     def __init__(
-        self, arm: ArmModel, link: UrLink, clock: WallClock, period_s: float = 0.002, send_s: float = 0.004
+        self,
+        arm: ArmModel,
+        link: UrLink,
+        clock: WallClock,
+        period_s: float = 0.002,
+        send_s: float = 0.004,
+        points: Mapping[int, AnalogSetPoint] | None = None,
     ) -> None:
+        """`points`: set points at analog outputs, by the index of their value in `set_values`."""
         super().__init__()
+        self._points = points or {}
         self._arm, self._link, self._clock, self._period_s = arm, link, clock, period_s
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
+        self._set = self.DeclareVectorInputPort("set_values", 4)
         # Numbers only, because an update of abstract state would make Drake copy and compute everything anew, 500 times
         # a second. One group for each port, which Drake then fills without Python.
         self._desired = self.DeclareDiscreteState(np.concatenate([found.q, np.zeros(6)]))
@@ -189,8 +214,17 @@ class UrRtdeArm(LeafSystem):
         # so that what is no number reaches the worker, which refuses it
         moving = not np.abs(wanted).max() < STILL_RAD_S
         self._clock.velocity_leaves(late_s, moving)
-        self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process)
+        self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process, *self._shares(context))
         return EventStatus.Succeeded()
+
+    def _shares(self, context: Context) -> tuple[np.ndarray, ...]:
+        """Return the shares (2,) of the analog outputs; empty where nothing sets them."""
+        if not self._points or not self._set.HasValue(context):
+            return ()
+        values, shares = self._set.Eval(context), np.full(2, np.nan)
+        for index, point in self._points.items():
+            shares[point.output] = point.share(float(values[index]))
+        return (shares,)
 
     def _pose(self, context: Context, output: Any) -> None:
         output.set_value(tick_flange_pose(self._arm, context.get_discrete_state(self._position).value()))
@@ -313,9 +347,11 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     """Add the arm with its link; the simulated arm follows the real one, for the rendered sensors."""
     if build.robot is None or not isinstance(build.robot.handle, UrLink) or build.robot.clock is None:
         raise RuntimeError("the robot was not prepared")
-    arm = UrRtdeArm(build.arm, build.robot.handle, build.robot.clock)
+    points = {k: point for k, point in ((1, config.wire_feed), (2, config.arc_voltage)) if point is not None}
+    arm = UrRtdeArm(build.arm, build.robot.handle, build.robot.clock, points=points)
     process = () if config.process_output is None else ("arm.process_on",)
     arc = () if config.arc_input is None else ("arm.arc_established",)
-    build.add("arm_link", arm, *ARM_PORTS, *process, *arc)
+    values = ("arm.set_values",) if points else ()
+    build.add("arm_link", arm, *ARM_PORTS, *process, *arc, *values)
     if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
@@ -76,6 +77,10 @@ class AnalogSetPoint:
     at_full: float = 0.0  # what it makes of 10 V or 20 mA
     value: float = 0.0  # while the torch is asked for; the output is at 0 V or 4 mA otherwise
 
+    def share(self, value: float) -> float:
+        """Return the share of the output's range for a value; NaN for none."""
+        return (value - self.at_zero) / (self.at_full - self.at_zero)
+
     def level(self, key: str) -> "Level":
         """Return the output's level, for `key` of the scenario. Raises InputError where no output can show it."""
         if self.output not in OUTPUTS:
@@ -88,7 +93,7 @@ class AnalogSetPoint:
                 f"robot.{key}.at_full must say what the power source makes of {full}, and it must differ from at_zero "
                 f"({self.at_zero:g})."
             )
-        share = (self.value - self.at_zero) / (self.at_full - self.at_zero)
+        share = self.share(self.value)
         if not 0.0 < share <= 1.0:
             raise InputError(
                 f"robot.{key}.value must be between at_zero ({self.at_zero:g}, which is off) and at_full"
@@ -104,6 +109,11 @@ class Level:
     output: int
     volts: bool
     share: float
+
+    def wanted(self, shares: Sequence[float] | Array | None) -> float:
+        """Return the share that the output is to have: of `shares` (2,) its own; where that is NaN, the scenario's."""
+        found = math.nan if shares is None else float(shares[self.output])
+        return self.share if math.isnan(found) else min(max(found, 0.0), 1.0)
 
     def shown(self, value: float, domains: int) -> float:
         """Return the share of the range that the controller reports (V or A); NaN where somebody changed the range."""

@@ -184,6 +184,8 @@ class Given:
     stop: bool
     process: bool  # the process output is enabled
     qd: Array = field(metadata=JOINTS)
+    # of the range of analog outputs 0 and 1, while the torch is asked for; NaN: the scenario's value
+    shares: Array = field(default_factory=lambda: np.full(2, np.nan), metadata={"numbers": 2})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

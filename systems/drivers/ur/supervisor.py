@@ -156,6 +156,7 @@ class VelocityCommand:
     orphaned: bool = False  # the cell's process has ended
     process: bool = False  # the process output is enabled
     armed: bool = False  # the set points of the power source are given
+    shares: Array = field(default_factory=lambda: np.full(2, np.nan))  # of analog outputs 0 and 1, see Given
     scale: float = 1.0  # of the velocity while the command is late
 
     @property

@@ -149,6 +149,7 @@ class Worker:
             stop=found.stop,
             orphaned=orphaned,
             process=found.process,
+            shares=found.shares,
         )
 
     def _with_torch(self, command: VelocityCommand, robot: ControllerStream, sample: RobotSample) -> VelocityCommand:
@@ -159,7 +160,7 @@ class Worker:
             self._valve(robot, flows and not self._put_out)
         if self._config.levels:
             shown = zip(self._config.levels, sample.set_points, strict=True)
-            right = not any(apart(level.share, share) for level, (_, share) in shown)
+            right = not any(apart(level.wanted(command.shares), share) for level, (_, share) in shown)
             armed, torch = self._points.step(sample.robot_time, torch, right)
         return replace(command, process=torch, armed=armed)
 
@@ -190,7 +191,7 @@ class Worker:
             # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault:
             # they go to zero.
             armed = command.armed and now - command.given_at <= self._config.limits.late_s
-            if not robot.send(command.scaled_qd, ACCELERATION, command.process, armed):
+            if not robot.send(command.scaled_qd, ACCELERATION, command.process, armed, command.shares):
                 self._phase = WorkerPhase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()

@@ -1,6 +1,6 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibrationPosePlanner, IterativeCalibrator
@@ -45,6 +46,7 @@ from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.locate.part.joint import read_limits
+from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
 
@@ -304,13 +306,14 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     assert station.tool is not None
     assert station.cad is not None
     # a live calibration states its own
+    speeds = () if welding.schedule is None else welding.schedule.speeds_m_s()
     sigma_mm = scenario.calibration.required_error_mm if scenario.job.calibrate else scenario.job.X_BC_sigma_mm
     return SeamPlanning(
         arm=station.arm,
         tool=station.tool,
         workpiece=station.cad,
         X_BP_guess=spec.pose_guess.pose(),
-        config=config,
+        config=replace(config, weld_speed_m_s=max(speeds)) if speeds else config,  # the arm must follow the fastest
         q_near=np.deg2rad(scenario.home_deg),
         clearance_m=welding.clearance_mm * 1e-3,
         seam_length_m=None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
@@ -323,6 +326,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         tolerance_m=1e-3 * welding.tolerance_mm,
         pass_obstacles=welding.pass_obstacles,
         limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
+        schedule=welding.schedule,
     )
 
 
@@ -371,7 +375,9 @@ def _add_welding(
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
     more = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
-    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, more))
+    servo = wiring.add(
+        "welding_servo", WeldingVelocityServo(station.arm, tool, config, more, scenario.welding.schedule)
+    )
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),
@@ -382,8 +388,21 @@ def _add_welding(
         hold=spine.hold,
         calibration_status=status,
     )
-    if station.diagram.HasOutputPort("arm.arc_established"):
-        wiring.connect(servo, arc_established=out("arm.arc_established"))
+    reported = next((p for p in ("power_source.arc_established", "arm.arc_established") if station.has(p)), None)
+    if reported is not None:
+        wiring.connect(servo, arc_established=out(reported))
+    schedule = wiring.add("arc_schedule", ArcSchedule(scenario.welding.schedule or WeldSchedule()))
+    wiring.connect(
+        schedule,
+        servo_report=servo.GetOutputPort("servo_report"),
+        planned_seam=planner.GetOutputPort("planned_seam"),
+        process_on=spine.switch.GetOutputPort("process_on"),
+    )
+    if reported is not None:
+        wiring.connect(schedule, arc_established=out(reported))
+    for port in ("power_source.set_values", "arm.set_values"):
+        if station.diagram.HasInputPort(port):
+            wiring.feed(port, schedule.GetOutputPort("set_values"))
     guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
     wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=position)
     logged = {
@@ -393,8 +412,9 @@ def _add_welding(
         "position": position,
     }
     others = {"tip_and_deflection": "cheat.contact", "torch": "cheat.torch"}
-    others |= {"arc": "arm.arc_established", "arc_values": "arm.arc_values"}  # where the power source gives them
-    logged |= {name: out(port) for name, port in others.items() if station.diagram.HasOutputPort(port)}
+    others |= {"arc": reported or "", "arc_values": "power_source.arc_values"}  # where the power source gives them
+    logged |= {name: out(port) for name, port in others.items() if station.has(port)}
+    logged |= {"set_values": schedule.GetOutputPort("set_values"), "gap": schedule.GetOutputPort("gap")}
     logged["torch_on"] = spine.switch.GetOutputPort("process_on")
     ports = {"velocity": guard.GetOutputPort("velocity"), "margin": guard.GetOutputPort("margin"), "logged": logged}
     ports["torch_wanted"] = servo.GetOutputPort("torch_on")

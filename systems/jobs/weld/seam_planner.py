@@ -24,8 +24,9 @@ from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning,
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.systems.motion.buffers import PoseHistory
-from weldcal.welding.locate.part.joint import check_fit_up
+from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
@@ -96,6 +97,7 @@ class SeamPlanning(Welder):
     X_BC_sigma_m: float | None = None  # of the known pose
     tolerance_m: float = math.inf  # of sigma across a seam that is not felt
     limits: Mapping[str, tuple[float, float]] = dc.field(default_factory=dict)  # of the fit-up, see read_limits
+    schedule: WeldSchedule | None = None  # of the power source
     pass_obstacles: bool = False  # the seam is interrupted there
     piece: int = 0  # of an interrupted seam
     number: int = 0  # of the seam
@@ -254,7 +256,7 @@ def plan_seam(
         record = SeamRecord(planning.number, found.fit_up)
         if found.fit_up is not None and isinstance(planning.workpiece, Part):
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
-        seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
+        seam = whole = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
             beside = (points_B, planning.workpiece.mesh, found.X_BP)
             if planning.pass_obstacles:
@@ -280,6 +282,7 @@ def plan_seam(
             records=(*planning.earlier, record),
             more=more,
             touch_arc_m=planning.config.touch.arc_m if record.left_out else None,
+            gap=planned_gap(planning, found.fit_up, whole, seam),
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
@@ -288,6 +291,21 @@ def plan_seam(
         )
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error), records=(*planning.earlier, record))
+
+
+def planned_gap(planning: SeamPlanning, fit_up: FitUp | None, whole: SeamCurve, piece: SeamCurve) -> GapAlong | None:
+    """The measured gap along a piece of a seam; None where no schedule follows it.
+
+    Raises:
+        ScheduleError: the scan does not show the gap, or the schedule has no row for it.
+    """
+    schedule = planning.schedule
+    if schedule is None or not schedule.by_gap:
+        return None
+    if fit_up is None:
+        return gap_along(np.zeros(0), None, None, schedule)
+    start_m = float(whole.project(np.asarray(piece.position(0.0))))
+    return gap_along(fit_up.s_m - start_m, fit_up.values.get("gap"), fit_up.sigmas.get("gap"), schedule)
 
 
 def interrupted(
@@ -303,9 +321,7 @@ def interrupted(
     chord = planning.tool.chord_m
     pieces = clear_pieces(seam, stops, chord, RUN_UP_S * planning.config.weld_speed_m_s)
     if planning.piece >= len(pieces):
-        raise NoClearance(
-            "Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0
-        )
+        raise NoClearance("The obstacles beside the seam leave nothing of it to weld: remove them and scan again.", 0.0)
     start, end, down = pieces[planning.piece]
     ends = [0.0, *(s for a, b, _ in pieces for s in (a, b)), seam.length]
     left_out = tuple((a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1e-6)

@@ -148,8 +148,10 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         windows=SeamWindows.of(tool),
         felt=felt,
         torch=TorchControl(
-            ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s(),
-            from_rest=welding.arc.from_rest(scenario.robot.reports_arc),
+            ignition_limit_s=TorchControl().ignition_limit_s
+            + scenario.robot.torch_delay_s()
+            + scenario.power_source.torch_delay_s(),
+            from_rest=welding.arc.from_rest(scenario.reports_arc),
             start_s=welding.arc.start_s,
             crater_s=welding.arc.crater_s,
         ),
@@ -283,7 +285,7 @@ def check_scan_moves(scenario: Scenario, station: Station) -> None:
                 else "home from the last of planning.scan_poses_deg"
             )
             raise InputError(
-                f"On the way {where} the arm would touch the table, the part, the surroundings or itself: choose"
+                f"On its move {where} the arm would touch the table, the part, the surroundings or itself: choose"
                 " another pose."
             )
 

@@ -15,6 +15,8 @@ from weldcal.systems.jobs.weld.arm_way import leaning
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
+from weldcal.welding.numerics import changed
+from weldcal.welding.record.schedule import GapAlong, WeldSchedule
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
@@ -50,6 +52,15 @@ class ServoReport(Message):
         return self.interruption.way_back_m
 
 
+def at_gap(config: ServoConfig, schedule: WeldSchedule, gap: GapAlong | None, state: WeldingState) -> ServoConfig:
+    """The settings with the schedule's speed for the gap beside the torch; before the touch with its largest speed."""
+    speeds = schedule.speeds_m_s()
+    if gap is None or not speeds:
+        return config
+    speed = max(speeds) if state.plan_fit is None else schedule.speed_m_s(gap.at(state.s_torch), config.weld_speed_m_s)
+    return changed(config, weld_speed_m_s=speed)
+
+
 class WeldingVelocityServo(LeafSystem):
     """Algorithm 2 with the corrected equations, at 125 Hz, while the job's mode is `weld`.
 
@@ -79,10 +90,16 @@ class WeldingVelocityServo(LeafSystem):
     """
 
     def __init__(
-        self, arm: ArmModel, tool: WeldingTool, config: ServoConfig, others: Sequence[ServoConfig] = ()
+        self,
+        arm: ArmModel,
+        tool: WeldingTool,
+        config: ServoConfig,
+        others: Sequence[ServoConfig] = (),
+        schedule: WeldSchedule | None = None,
     ) -> None:
         super().__init__()
         self._arm, self._tool, self._configs = arm, tool, (config, *others)
+        self._schedule = schedule
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._deformation = self.DeclareAbstractInputPort("deformation", AbstractValue.Make(Deformation()))
         self._q = self.DeclareVectorInputPort("position_measured", 6)
@@ -118,6 +135,8 @@ class WeldingVelocityServo(LeafSystem):
         memory = old.state if old.state is not None else WeldingState()
         config = self._configs[min(job.seam, len(self._configs) - 1)]
         config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
+        if self._schedule is not None:
+            config = at_gap(config, self._schedule, planned.gap, memory)
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
         memory, held, command = interruptible_step(memory, old.interruption, sample, planned.seam, config, holds)
         report = ServoReport(

@@ -18,6 +18,7 @@ class StillLink:
         self.fault = Fault.NONE
         self.commands: list[np.ndarray] = []
         self.processes: list[bool] = []
+        self.shares: np.ndarray | None = None  # of the newest command
 
     def state(self) -> LinkState:
         """What a worker would have written."""
@@ -26,8 +27,9 @@ class StillLink:
             q=self.q, qd=self.qd, robot_time=self.robot_time, age_s=self.age_s, fault=self.fault, arc=-1, **state
         )
 
-    def command(self, qd: np.ndarray, process: bool = False) -> int:
+    def command(self, qd: np.ndarray, process: bool = False, shares: np.ndarray | None = None) -> int:
         """Remember it."""
+        self.shares = shares
         self.processes.append(process)
         self.commands.append(np.array(qd))
         return len(self.commands)

@@ -11,6 +11,7 @@ from tests.systems.drivers.still_link import StillLink
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
+from weldcal.systems.drivers.ur.set_points import AnalogSetPoint
 from weldcal.systems.wall_clock import WallClock
 
 Q = np.array([0.0, -1.4, 1.9, -2.1, -1.6, 0.0])
@@ -156,3 +157,16 @@ def test_a_fault_of_the_link_is_the_status_of_the_arm(link: StillLink) -> None:
     driven.simulator.AdvanceTo(0.02)
     assert not status.Eval(driven.context).ready
     assert status.Eval(driven.context).fault.startswith("PROTECTIVE STOP")
+
+
+def test_set_values_of_the_power_source_become_shares_of_the_analog_outputs(link: StillLink) -> None:
+    points = {1: AnalogSetPoint(output=1, at_zero=0.0, at_full=20.0), 2: AnalogSetPoint(output=0, at_full=40.0)}
+    system = UrRtdeArm(load_arm(), link, WallClock(1.0), points=points)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.GetInputPort("velocity_command").FixValue(context, np.zeros(6))
+    simulator.AdvanceTo(0.01)
+    assert link.shares is None, "nothing sets them: the scenario's values"
+    system.GetInputPort("set_values").FixValue(context, [3.0, 8.0, np.nan, 200.0])
+    simulator.AdvanceTo(0.02)
+    np.testing.assert_allclose(link.shares, [np.nan, 0.4])

@@ -12,6 +12,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.set_points import SETTLES_S, AnalogSetPoint, Gas, SetPoints, apart, levels_of
+from weldcal.welding.record.schedule import HotStart, WeldSchedule
 
 FEED = AnalogSetPoint(output=0, unit="V", at_zero=1.0, at_full=22.0, value=8.0)
 VOLTAGE = AnalogSetPoint(output=1, unit="mA", at_zero=10.0, at_full=40.0, value=25.0)
@@ -29,6 +30,19 @@ def test_a_value_is_a_share_of_its_outputs_range() -> None:
     assert apart(0.0, math.nan)
     assert not apart(0.4, 0.41)
     assert levels_of(None, None) == ()
+
+
+def test_a_schedule_moves_the_share_and_stays_in_the_range() -> None:
+    feed, voltage = levels_of(FEED, VOLTAGE)
+    shares = [FEED.share(11.5), VOLTAGE.share(math.nan)]
+    assert feed.wanted(shares) == pytest.approx(0.5)
+    assert voltage.wanted(shares) == voltage.share, "what the schedule does not set is the scenario's"
+    assert [feed.wanted([share, 0.0]) for share in (-0.2, 1.3)] == [0.0, 1.0]
+    robot = UrRtde(wire_feed=FEED, arc_voltage=VOLTAGE)
+    assert robot.takes == ("wire_feed_m_min", "voltage_V")
+    robot.check_schedule(WeldSchedule(wire_feed_m_min=8.0, voltage_V=25.0))
+    with pytest.raises(InputError, match=r"robot\.wire_feed\.value must be between"):
+        robot.check_schedule(WeldSchedule(wire_feed_m_min=8.0, hot_start=HotStart(wire_feed_m_min=23.0)))
 
 
 @pytest.mark.parametrize(

@@ -202,7 +202,7 @@ def filled(kind: type[Any], first: float) -> Any:
     values: dict[str, Any] = {}
     for item in dc.fields(kind):
         start = first + 10.0 * len(values)
-        values[item.name] = np.arange(6.0) + start if item.metadata else item.type(start)  # type: ignore[operator]
+        values[item.name] = np.arange(float(item.metadata["numbers"])) + start if item.metadata else item.type(start)  # type: ignore[operator]
     return kind(**values)
 
 

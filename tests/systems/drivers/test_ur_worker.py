@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from types import SimpleNamespace
 from typing import Any
@@ -33,18 +34,29 @@ FRESH, LATE = range(5, 15), range(30, 40)  # passes of 4 ms; the cell computes f
 class RecordingRobot:
     """A healthy robot. Its set points are `right` or not. The cell's commands stop for 30 passes."""
 
-    def __init__(self, memory: Memory, right: bool, moves: int = 0) -> None:
+    def __init__(self, memory: Memory, right: bool, moves: int = 0, share: float = math.nan) -> None:
         self.clock = SimpleNamespace(to_host=float, residual_s=0.0, drift=0.0)
         self.numbers, self.echo_latency, self.process_on, self.powered = (0.0, 0.0, 0.0), 0.0, False, False
         self.sent: dict[int, tuple[bool, bool]] = {}
         self._memory, self._right, self._passes = memory, right, 0
+        self._shares, self.shares = (
+            np.array([share, math.nan]),
+            [0.0],
+        )  # of the schedule; of the outputs, as they were sent
         self._moves, self.ended = moves, 0  # passes in which the arm still moves; the pass in which its program ended
 
     def sample(self, now: float) -> RobotSample:
         self._passes += 1
         if not 15 <= self._passes < 45:
             self._memory.command.write(
-                Given(number=self._passes, host_time=now, stop=self._passes > 60, process=True, qd=np.zeros(6))
+                Given(
+                    number=self._passes,
+                    host_time=now,
+                    stop=self._passes > 60,
+                    process=True,
+                    qd=np.zeros(6),
+                    shares=self._shares,
+                )
             )
         return RobotSample(
             robot_time=now,
@@ -60,8 +72,16 @@ class RecordingRobot:
             set_points=((0.5, 0.5) if self._right else (0.0, 0.0),),
         )
 
-    def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
+    def send(
+        self,
+        qd: np.ndarray,
+        acceleration: float,
+        process: bool = False,
+        armed: bool = False,
+        shares: np.ndarray | None = None,
+    ) -> bool:
         self.sent[self._passes] = (process, armed)
+        self.shares.append(CONFIG.levels[0].wanted(shares))
         return True
 
     def end_program(self) -> None:
@@ -93,10 +113,10 @@ CONFIG = WorkerConfig(
 )
 
 
-def run(right: bool, moves: int = 0) -> tuple[RecordingRobot, Fault]:
+def run(right: bool, moves: int = 0, share: float = math.nan) -> tuple[RecordingRobot, Fault]:
     """Run a worker for which the torch is wanted, until it is stopped."""
     memory = memory_of()
-    robot = RecordingRobot(memory, right, moves)
+    robot = RecordingRobot(memory, right, moves, share)
     assert Worker(CONFIG, memory).run(robot) == 0  # type: ignore[arg-type]
     published = memory.state.read()
     assert published is not None
@@ -117,6 +137,15 @@ def test_set_points_that_wait_for_the_torch_go_to_zero_under_a_late_command() ->
     assert {robot.sent[k] for k in LATE} == {(False, False)}
     assert {robot.sent[k] for k in range(50, 60)} == {(False, True)}, "a cell that goes on gets them again"
     assert fault is Fault.NONE
+
+
+def test_the_torch_waits_for_the_share_of_the_schedule() -> None:
+    """The output shows 0.5, which is the scenario's share."""
+    robot, _ = run(right=True, share=0.7)
+    assert {robot.sent[k] for k in FRESH} == {(False, True)}
+    assert robot.shares[10] == 0.7
+    robot, _ = run(right=True, share=0.5)
+    assert robot.sent[16] == (True, True)
 
 
 def test_a_late_command_with_the_torch_on_is_a_fault_and_the_torch_stays_off() -> None:

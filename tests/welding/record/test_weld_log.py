@@ -141,6 +141,15 @@ def test_the_heat_is_summed_up_where_it_is_known() -> None:
     assert summary is not None
     assert summary == pytest.approx((0.432, 0.432))  # 0.8 * 24 V * 180 A / 8 mm/s
     assert heat_summary(record(WeldProcess())) is None
+    stood = record()
+    on = stood.torch_on
+    rows = np.flatnonzero(on)[: on.sum() // 2]
+    stood["torch_speed_m_s"][:] = 8e-3
+    stood["torch_speed_m_s"][rows] = 1e-6  # half of the time at rest, nearly: the same metal gets twice the heat
+    stood["heat_input_J_m"][rows] = 0.8 * 24.0 * 180.0 / 1e-6
+    found = heat_summary(stood)
+    assert found is not None
+    assert found[0] == pytest.approx(0.432 * on.sum() / (on.sum() - len(rows)), rel=0.01)
 
 
 def test_every_column_is_in_the_document_with_its_unit_and_frame(repository: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.report.plots_record import arc_over_time
 from weldcal.tools.report.weld_record import PartRecord
 from weldcal.welding.record.order import OrderLimits, WeldOrder, WeldOrderError
 from weldcal.welding.record.process import WeldProcess
@@ -62,6 +63,16 @@ def test_measured_values_count_more_than_set_ones() -> None:
     assert (current.least, current.mean, current.most) == pytest.approx((100.0, 200.0, 300.0), rel=0.01)
     # 0.8 * 25 V * (100, 300) A: 2000 W at 10 mm/s and 6000 W at 5 mm/s; 16 kJ over 30 mm
     assert (heat.least, heat.mean, heat.most) == pytest.approx((0.2, 0.5333, 1.2), rel=0.01)
+
+
+def test_what_the_schedule_sets_counts_before_the_process() -> None:
+    found = only(log(TWO_SPEEDS, set_current_A=[100.0] * 501, set_voltage_V=[25.0] * 501))
+    assert (found.arc_values, found.figures["current_A"].mean) == ("set", pytest.approx(100.0))
+    # 0.8 * 25 V * 100 A: 2000 W at 10 mm/s
+    assert found.figures["heat_input_kJ_mm"].least == pytest.approx(0.2, rel=0.01)
+    measured = only(log(TWO_SPEEDS, set_current_A=[100.0] * 501, set_voltage_V=[25.0] * 501,
+                        current_A=[110.0] * 501, voltage_V=[24.0] * 501))  # fmt: skip
+    assert (measured.arc_values, measured.figures["current_A"].mean) == ("measured", pytest.approx(110.0))
 
 
 def test_without_arc_values_no_heat_is_stated() -> None:
@@ -143,7 +154,16 @@ def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -
     record = log(TWO_SPEEDS)
     picture = np.arange(256, dtype=np.uint8).reshape(16, 16)
     png = cv2.imencode(".png", picture)[1].tobytes()
-    PartRecord(order=order, log=record, seams=(only(record),), pictures={"seam_1_start": png}).write(tmp_path)
+    plot = arc_over_time(record, record.torch_on, order.limits)
+    assert plot is not None
+    PartRecord(order=order, log=record, seams=(only(record),), pictures={"seam_1_start": png}, plots={1: plot}).write(
+        tmp_path
+    )
+    page = (tmp_path / "record.html").read_text()
+    assert "Record of the weld of part 0711" in page
+    assert "1 seam welded, 1 of the limits exceeded" in page
+    assert (page.count('<svg class="plot'), page.count("<img ")) == (1, 1)
+    assert not re.search(r'(src|href)="(?!data:|#)', page), "it needs no other file"
     with (tmp_path / "record.csv").open(newline="") as table:
         (row,) = csv.DictReader(table)
     assert (row["wps"], row["part"], row["seam"], row["arc_values"]) == ("WPS-12", "0711", "1", "set")
@@ -156,7 +176,7 @@ def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -
     assert document["order"] == {"wps": "WPS-12", "part": "0711", "limits": {"speed_mm_s": [6.0, 11.0]}}
     assert document["seams"][0]["figures"]["speed_mm_s"]["least"] == pytest.approx(5.0, rel=0.01)
     assert re.fullmatch(
-        r"Seam 1: travel speed is 5\.0 to 10\.0, and the limit is 6 to 11\.", *document["outside_limits"]
+        r"Seam 1: travel speed is 5\.0 to 10\.0 mm/s, and the limit is 6 to 11\.", *document["outside_limits"]
     )
 
 
@@ -171,7 +191,7 @@ def test_every_column_of_the_record_is_in_the_document(repository: Path) -> None
 
 def test_a_log_of_before_is_read_without_the_later_columns(tmp_path: Path) -> None:
     table, header = weld_log_texts(log([0.010] * 20))
-    rows = [line.rsplit(",", 3)[0] for line in table.splitlines()]
+    rows = [line.rsplit(",", 7)[0] for line in table.splitlines()]
     assert rows[0].endswith("sigma_min")
     old = "\n".join(rows) + "\n"
     (tmp_path / "weld.csv").write_text(old)

@@ -131,11 +131,13 @@ def changed_keys(config: Any) -> list[tuple[SchemaKey, Any]]:
 def kind_in_words(kind: Any) -> str:
     """Return a type as a reader of the reference needs it."""
     if isinstance(kind, UnionType):
-        kinds = [k for k in get_args(kind) if k is not NoneType]
+        every = [k for k in get_args(kind) if k is not NoneType]
+        kinds = [k for k in every if k is not int or float not in every]
         return " or ".join(dict.fromkeys(kind_in_words(k) for k in kinds))
     if get_origin(kind) is list:
         inner = kind_in_words(get_args(kind)[0])
-        return f"list of {inner.replace('list', 'lists', 1) if inner.startswith('list') else inner + 's'}"
+        many = inner.replace("list", "lists", 1) if inner.startswith("list") else f"{inner}s"
+        return f"list of {inner if inner == 'keys below' else many}"
     return _WORDS.get(kind, "keys below" if dc.is_dataclass(kind) else getattr(kind, "__name__", str(kind)))
 
 

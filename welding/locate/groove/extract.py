@@ -61,7 +61,7 @@ def extract_groove(
         raise GrooveNotFound(
             f"No groove in any face: one longer than {1e3 * config.search.shortest_m:.0f} mm, deeper than "
             f"{1e3 * depth:.1f} mm and from {1e3 * config.least_pitches * pitch:.1f} to "
-            f"{1e3 * config.search.max_width_m:.0f} mm wide would be seen with points {1e3 * pitch:.1f} mm apart."
+            f"{1e3 * config.search.max_width_m:.0f} mm wide would be found with points {1e3 * pitch:.1f} mm apart."
         )
     if len(seams) == 1:
         return seams[0]

@@ -128,7 +128,7 @@ def _finish(
 ) -> GrooveSeam:
     """Ends, gaps, smoothed lines and their sigmas, in the cloud's frame and in the direction of travel."""
     if len(slices.s) < 5:
-        raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
+        raise GrooveNotFound("An opening was found whose cross-sections show no V: it is not a groove to weld.")
     pitch = groove.pitch_m
     refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
     first, last, gaps = measured_extent(f, line, profile, slices, groove)
@@ -196,18 +196,18 @@ def _finish(
         if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
             raise GrooveUncertain(
                 f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f}"
-                f" mm from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a"
+                f" mm from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart). Use a"
                 " finer scanner or move it nearer."
             )
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
             f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan"
             f" (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and"
-            f" {1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
+            f" {1e3 * config.most_sigma_m:.2f} mm are required. Use a finer scanner or move it nearer."
         )
     if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
         raise GrooveUncertain(
-            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its way there is only known to "
+            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its line there is only known to "
             f"{1e3 * np.max(sigma[~seen]):.1f} mm: clear the view or scan again from elsewhere."
         )
     base, normal = line.at(at)
@@ -337,7 +337,7 @@ def refuse_gap(f: Floats, line: SmoothLine, slices: Slices, profile: Profile, st
     """Raise GrooveNotFound for a flat floor (as deep half-way to the shoulders as in the middle) or vertical walls."""
     if max(profile.slopes) > math.tan(steepest_rad):
         raise GrooveNotFound(
-            f"An opening {1e3 * profile.depth:.1f} mm deep was seen with vertical walls: it is a gap or a slot, not a "
+            f"An opening {1e3 * profile.depth:.1f} mm deep was found with vertical walls: it is a gap or a slot, not a "
             "V-groove."
         )
     s, n, beside = line.coordinates(f[:, :2])
@@ -348,6 +348,6 @@ def refuse_gap(f: Floats, line: SmoothLine, slices: Slices, profile: Profile, st
     ratio = float(np.median(f[half_way, 2]) / np.median(f[middle, 2]))
     if ratio > 0.8:
         raise GrooveNotFound(
-            f"An opening {1e3 * profile.depth:.1f} mm deep was seen with a flat floor: it is a gap or a slot, not a "
+            f"An opening {1e3 * profile.depth:.1f} mm deep was found with a flat floor: it is a gap or a slot, not a "
             "V-groove."
         )

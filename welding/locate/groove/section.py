@@ -199,7 +199,7 @@ def measured_profile(f: Floats, line: SmoothLine, groove: CoarseGroove, config: 
     inner = np.abs(n) < 0.3 * groove.width_m
     if np.count_nonzero(inner) < 20:
         raise GrooveNotFound(
-            f"An opening {1e3 * groove.width_m:.1f} mm wide was seen, but no points inside it: scan from above."
+            f"An opening {1e3 * groove.width_m:.1f} mm wide was found, but no points inside it: scan from above."
         )
     depth = -float(np.percentile(z[inner], 10.0))
     slope = depth / (0.5 * groove.width_m)
@@ -213,7 +213,7 @@ def measured_profile(f: Floats, line: SmoothLine, groove: CoarseGroove, config: 
         or max(best.slopes) > math.tan(config.steepest_wall_rad)
     ):
         raise GrooveNotFound(
-            f"An opening {1e3 * groove.width_m:.1f} mm wide and {1e3 * depth:.1f} mm deep was seen, but it has no two "
+            f"An opening {1e3 * groove.width_m:.1f} mm wide and {1e3 * depth:.1f} mm deep was found, but it has no two "
             "sloping walls: it is a gap or a step, not a V-groove."
         )
     if best.width < config.least_pitches * groove.pitch_m:
@@ -305,7 +305,7 @@ def followed(
     slices = cut_slices(f, line, profile, sigma, pitch, half_slice, [])
     slices = agreed(slices) if settled else slices
     if len(slices.s) < 5:
-        raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
+        raise GrooveNotFound("An opening was found whose cross-sections show no V: it is not a groove to weld.")
     r, weight = slices.column("centre"), slices.sigma
     at = np.arange(0.0, line.length + STATION_M, STATION_M)
     # Wider than the last smoothing, because repeated moves accumulate noise.

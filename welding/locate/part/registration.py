@@ -368,13 +368,13 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
         )
     if a.met < config.min_met:
         raise PartNotFound(
-            f"The part does not fit the scan: only {100 * a.met:.0f} % of the rays that should meet it do, for"
-            " something stands before it: clear the view, or check which part this is."
+            f"The part does not fit the scan: only {100 * a.met:.0f} % of the rays that should meet it do. Something"
+            " hides it: clear the view, or check which part this is."
         )
     if a.met < config.min_agreement * (1.0 - a.hidden) or a.passed > config.max_violation:
         raise PartNotFound(
             f"The part does not fit the scan: of the rays that should meet it {100 * a.met:.0f} % do and"
-            f" {100 * a.passed:.0f} % pass through it; check which part this is, the file's unit and the calibration."
+            f" {100 * a.passed:.0f} % pass through it. Check which part this is, the file's unit and the calibration."
         )
 
 
@@ -425,7 +425,7 @@ def _decided(
     if harmful and (shown.met < POOR_MET * (1.0 - shown.hidden) or shown.passed > POOR_PASSED):
         raise PartNotFound(
             f"The part does not fit the scan: in its best pose {100 * shown.passed:.0f} % of the rays pass through it,"
-            " and other poses fit as badly; check which part this is and the file's unit."
+            " and other poses fit as badly. Check which part this is and the file's unit."
         )
     if harmful:
         motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
@@ -454,8 +454,8 @@ def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, conf
     harmful = [f.name for f in free if not harmless(f, matters_P)]
     if harmful:
         raise AmbiguousPart(
-            f"The part was found, but the scan does not fix its pose: it is {' and '.join(harmful)}; scan it so that"
-            " more of its sides or ends are seen, or give its pose."
+            f"The part was found, but the scan does not fix its pose: it is {' and '.join(harmful)}. Scan it so that"
+            " more of its sides or ends are in view, or give its pose."
         )
 
 
