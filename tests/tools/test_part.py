@@ -194,7 +194,7 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
     ]
     write_step(assembly(*plates), tmp_path / "mitre.step")
     words = ["part", str(tmp_path / "mitre.step"), "--plan", "0", "--out", str(tmp_path / "out")]
-    assert "a wider one cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
+    assert "is not listed and cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
     shape = read_shape(tmp_path / "mitre.step")
     outside = next(edge.id for edge in shape.edges if np.abs(edge.points_P[:, 1:]).max() < 1e-9)
     with pytest.raises(InputError, match=r"opens 270 deg, .* cannot be welded: weld its inside\."):

@@ -169,7 +169,7 @@ def outside_hint(shape: PartShape) -> str:
     sides = [joint.side for joint in shape.joints if joint.type == "corner"]
     if sides.count("inside") <= sides.count("outside"):
         return ""
-    return "The outside of a corner is listed where it opens at most 180 deg; a wider one cannot be welded: weld its inside."
+    return "The outside of a corner that opens more than 180 deg is not listed and cannot be welded: weld its inside."
 
 
 def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
