@@ -25,6 +25,10 @@ class LandmarksNotFound(WeldcalError):
     """A camera image does not show the landmarks that the tablet displays."""
 
 
+class ToolNotFound(WeldcalError):
+    """Scans or touches do not show a part of the tool."""
+
+
 class FeatureNotFound(WeldcalError):
     """A profile does not show the feature that was asked for."""
 

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, PortDataType
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from weldcal.models.errors import InputError
@@ -48,6 +48,17 @@ class Cell(Generic[JobOf]):
     job: JobOf
     logs: dict[str, VectorLogSink]
     operator: Operator = dc.field(default_factory=Operator)
+
+    @property
+    def ports(self) -> dict[str, str]:
+        """The diagram's output ports by name: the class of the values, or how many numbers a vector has."""
+        found = {}
+        for k in range(self.diagram.num_output_ports()):
+            port = self.diagram.get_output_port(k)
+            vector = port.get_data_type() == PortDataType.kVectorValued
+            value = None if vector else port.Allocate().get_value()
+            found[port.get_name()] = f"vector of {port.size()}" if vector else type(value).__name__
+        return found
 
     @property
     def plant(self) -> MultibodyPlant | None:

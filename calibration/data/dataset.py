@@ -465,7 +465,7 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
         if ending_of(p) in NO_NOTES and cloud_id(p) not in poses and not p.name.startswith(".")
     ]
     if orphans:
-        names = ", ".join(p.name for p in orphans[:5])
+        names = ", ".join(p.name for p in orphans[:5]) + (f" and {len(orphans) - 5} more" if len(orphans) > 5 else "")
         raise DatasetError(
             f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or remove the "
             "cloud."

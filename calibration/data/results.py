@@ -1,6 +1,7 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
 import json
+import shlex
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -376,7 +377,9 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
     """Where a user of the pose finds the scanner correction: the command and the Python call that apply it."""
     call = f", in Python weldcal.read_calibration({str(file)!r}).correct(points)" if symbol == "X_BC" else ""
-    return f"{symbol} applies to corrected scanner points: weldcal apply {file} CLOUD writes them{call}."
+    return (
+        f"{symbol} applies to corrected scanner points: weldcal apply {shlex.quote(str(file))} CLOUD writes them{call}."
+    )
 
 
 def correction_note(result: CalibrationResult, file: Path | str | None = None) -> str | None:

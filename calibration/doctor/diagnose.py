@@ -17,7 +17,8 @@ from weldcal.calibration.doctor.case import FEWEST, DoctorCase
 from weldcal.calibration.doctor.fit import NU, CauseFit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import inverse, log_rotation, pose
+from weldcal.calibration.geometry.se3 import as_transform, inverse, log_rotation, pose
+from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.arrays import Array
 
 UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
@@ -384,16 +385,22 @@ class Cause:
     words: str = ""
 
 
+ALIKE_DEG = 3.0  # as in the warning of calibrate: orientations closer than this are one orientation
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """The causes, likeliest first.
 
     The number of scans, and the spread (m) of their centres about what explains them best.
+    ``alike_deg``: the largest rotation between poses that hardly differ in orientation, which show no wrong TCP (NaN:
+    they differ).
     """
 
     causes: tuple[Cause, ...]
     n: int
     spread_m: float
+    alike_deg: float = float("nan")
 
 
 def diagnose(case: DoctorCase) -> Diagnosis:
@@ -453,7 +460,9 @@ def diagnose(case: DoctorCase) -> Diagnosis:
     if left is not None:
         causes = [left]
     causes.sort(key=lambda c: -c.score)
-    return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
+    turned = turn_deg([as_transform(X) for X in case.X_BF]) if case.oriented else 0.0
+    alike = turned if turned < ALIKE_DEG else float("nan")
+    return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))), alike)
 
 
 def _ranked(case: DoctorCase, null: CauseFit) -> list[Explained]:

@@ -119,7 +119,8 @@ def _read(name: str, before: tuple[Path, ...]) -> Scenario:
             f"{before[-1].name} extends '{name}', which does not exist" if before else f"There is no scenario '{name}'"
         )
         listed = f"choose one of {', '.join(scenario_names())} or give a YAML file."
-        raise InputError(f"{asked}: {did_you_mean(name, scenario_names(), listed)}")
+        near = [str(p) for p in sorted(path.parent.glob("*.yaml"))] if path.parent.is_dir() else []
+        raise InputError(f"{asked}: {did_you_mean(name, [*near, *scenario_names()], listed)}")
     if path.resolve() in before:
         raise InputError(f"{before[0].name} extends itself through {path.name}: remove one `extends`.")
     text = read_text(path, LARGEST_DOCUMENT)

@@ -16,6 +16,7 @@ CHEAP = (
         "schema",
         "part",
         "tool check",
+        "tool measure",
         "print-board",
         "verify",
         "apply",

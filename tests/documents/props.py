@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import weldcal
 from tests.calibration.hand_eye import rendering
 from tests.calibration.tablet.visit import write_visit
+from tests.calibration.tool import torches
 from tests.documents.scans import write_scans, write_wrist_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
@@ -143,6 +144,17 @@ def _recording(path: Path) -> None:
         shutil.copy(result / path.name, path)
 
 
+def _torch(name: str) -> Callable[[Path], None]:
+    """Scans of a bent torch, the calibration of their scanner, or touches of its wire, all of one cell."""
+
+    def write(path: Path) -> None:
+        with TemporaryDirectory() as folder:
+            torches.written(torches.cell(11, torches.Wrong(bend=2e-4), scans=8), Path(folder))
+            shutil.move(Path(folder) / name, path)
+
+    return write
+
+
 def _profiler(name: str) -> Callable[[Path], None]:
     """One set of the fixed profiler files, in mm, with the names of docs/profiler.md."""
 
@@ -214,6 +226,9 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "touches.csv": lambda path: write_visit(path.parent),
     "touched_points.csv": lambda path: path.write_text(touches_text(touch_world(20).touches), encoding="utf-8"),
     "touched-calibration": lambda path: save_result(touch_world(20).result, path),
+    "torch_scans": _torch("scans"),
+    "torch_result": _torch("result"),
+    "wire_touches.csv": _torch("touches.csv"),
     "edge.npz": _profiler("edge"),
     "sphere.npz": _profiler("sphere"),
     "groove.npz": _profiler("groove"),

@@ -32,6 +32,9 @@ OTHERS = {
     "robots": "robots ur10e",
     "print-board": "print-board",
     "doctor": "doctor three_scans",
+    "tool measure": (
+        "tool measure torch_scans --calibration torch_result --tool my_tool.yaml --touches wire_touches.csv"
+    ),
     "profiler edge": "profiler edge edge.npz",
     "profiler seam": "profiler seam groove.npz --calibration my-profiler",
 }

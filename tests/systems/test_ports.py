@@ -35,11 +35,13 @@ from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background import BackgroundSystem
+from weldcal.systems.drivers.power.modbus import ModbusPowerSourcePorts, PowerLink
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
 from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import DisplacedStand, PicturePoses
+from weldcal.systems.drivers.simulated.power_source import SimulatedArc, SimulatedPowerSource
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
@@ -76,6 +78,7 @@ from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
 from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchConfig, TouchPlanner, TouchPlanning
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
+from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.jobs.weld.iterative_calibrator import (
@@ -117,6 +120,7 @@ from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.viewer.live import LiveView, LiveWriter
 from weldcal.systems.wall_clock import WallClock
+from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.settings import ServoConfig
 
@@ -177,6 +181,11 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
     UrTouchProbeInput: lambda: UrTouchProbeInput(cast("ProbeInput", SimpleNamespace(touches=Touches()))),
+    SimulatedArc: lambda: SimulatedArc(SimulatedPowerSource()),
+    ModbusPowerSourcePorts: lambda: ModbusPowerSourcePorts(
+        cast("PowerLink", SimpleNamespace(shown={"arc_established": 0.0}, command=lambda on, values: None))
+    ),
+    ArcSchedule: lambda: ArcSchedule(WeldSchedule()),
     DeviceWatch: lambda: DeviceWatch(acquisition()),
     OnTrigger: lambda: OnTrigger(acquisition(), "scan", Scan, 0.02),
     WiredScanStream: lambda: WiredScanStream(acquisition()),
@@ -320,6 +329,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     UrRtdeArm: {
         "velocity_command": 6,
         "process_on": 1,
+        "set_values": 4,
         "desired_state": 12,
         "position_measured": 6,
         "velocity_measured": 6,
@@ -338,6 +348,16 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "newest_capture": 2,
     },
     UrTouchProbeInput: {"touch": TorchTouch},
+    SimulatedArc: {"process_on": 1, "set_values": 4, "arc_established": 1, "arc_values": 2},
+    ModbusPowerSourcePorts: {"process_on": 1, "set_values": 4, "arc_established": 1, "arc_values": 2},
+    ArcSchedule: {
+        "servo_report": ServoReport,
+        "planned_seam": PlannedSeam,
+        "process_on": 1,
+        "arc_established": 1,
+        "set_values": 4,
+        "gap": 1,
+    },
     DeviceWatch: {"robot_status": UrStatus, "status": UrStatus},
     OnTrigger: {"trigger": 1, "scan": Scan},
     WiredScanStream: {"streaming": 1, "stream": ScanStream},

@@ -152,7 +152,7 @@ def _of_weld(folder: Path) -> tuple[Cause, ...]:
 
 
 def _both(found: Diagnosis, more: tuple[Cause, ...]) -> Diagnosis:
-    return Diagnosis(tuple(sorted((*found.causes, *more), key=lambda c: -c.score)), found.n, found.spread_m)
+    return replace(found, causes=tuple(sorted((*found.causes, *more), key=lambda c: -c.score)))
 
 
 def weld_causes(record: WeldRecord | None, reason: str) -> tuple[Cause, ...]:

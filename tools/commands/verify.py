@@ -291,6 +291,7 @@ def verify_dataset(
         verdict=verdict,
         source=source,
         dataset=str(dataset),
+        calibration=str(result),
     )
     tell("writing the report", 0.9)
     write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))

@@ -43,6 +43,7 @@ from weldcal.tools.report.first_screen import (
     WorkPoint,
     limit_tolerance,
     refused_note,
+    typed,
     work_point_error,
     work_point_expected,
 )
@@ -149,7 +150,9 @@ class CalibrationReport:
         corrected = correction_note(r, self.out / RESULT_FILE)
         notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
-        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
+        n, left = len(r.poses), len(self.refused)
+        lead = f"{n - left} of {n} scans are used." if left else ""
+        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),), lead=lead)
 
     @property
     def _remarks(self) -> list[str]:
@@ -169,9 +172,9 @@ class CalibrationReport:
         if concerns:
             return Next(
                 "See what disturbs the scans, then verify on scans that the calibration has not seen.",
-                f"weldcal doctor {self.out}",
+                typed("doctor", self.out),
             )
-        return Next("Take four or more new scans, and verify with them.", f"weldcal verify {self.out} NEW_SCANS")
+        return Next("Take four or more new scans, and verify with them.", typed("verify", self.out, "NEW_SCANS"))
 
     @property
     def work_point(self) -> WorkPoint:
@@ -326,7 +329,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         fits=bool(report.fits),
         r=r,
         n_used=int(used.sum()),
-        n_total=len(report.observations) + len([p for p in r.poses if p.held_out_mm is None]),
+        n_total=len(r.poses),
         work_sigma_mm=work_sigma,
         pose_rows=_pose_table(report),
         feature_rows=feature_table(report.fits, report.patterns),

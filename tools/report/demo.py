@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
@@ -26,6 +27,7 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     after_hold,
     refused_note,
+    typed,
     upper,
     work_point_error,
     work_point_expected,
@@ -123,7 +125,7 @@ class DemoResult:
             "the expected error at the work point, one sigma,",
             1e3 * status.predicted_error_m,
             c.required_error_mm,
-            "calibration.required_error_mm",
+            "calibration.required_error_mm, one sigma too; with 95 % probability see below",
         )
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
@@ -186,13 +188,15 @@ class DemoResult:
             return after_hold(
                 self.run.ended_by_operator,
                 "Look for the cause in scans and weld, remove it, then run the job again.",
-                f"weldcal doctor {folder}",
+                typed("doctor", folder),
             )
         if self.weld is not None and robot:
-            return Next("Look at the weld and at its log, weld.csv.", f"weldcal view {folder}")
+            return Next("Look at the weld and at its log, weld.csv.", typed("view", folder))
         if self.weld is not None:
-            return Next("See it again; then try your own part.", f"weldcal view {folder}")
-        return Next("Verify with scans that the calibration has not seen.", f"weldcal verify {folder} NEW_SCANS")
+            part = self.run.cell.scenario.workpiece
+            own = part is not None and part.file is not None
+            return Next(f"See it again{'' if own else '; then try your own part'}.", typed("view", folder))
+        return Next("Verify with scans that the calibration has not seen.", typed("verify", folder, "NEW_SCANS"))
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
@@ -418,6 +422,16 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     return svg(picture)
 
 
+NEXT_SEAM_S = 0.5  # a choice: rows of one seam are 8 ms apart, and between two seams the arm goes home
+
+
+def broken(values: Array, at: NDArray[np.intp]) -> Array:
+    """Return a copy (N, ...) with NaN in the rows ``at``: a line that is drawn through it has a gap there."""
+    found = np.array(values, dtype=float)
+    found[at] = np.nan
+    return found
+
+
 def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     """Return the weld for the pictures, over the planned seam; y of the base is drawn to the right, as in the cell."""
     log, named = weld.log, weld.log.telemetry
@@ -427,14 +441,18 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     if weld.planned is not None:
         up = weld.planned.up(named["s_torch"])
         work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.torch.work_angle_rad))
-    errors = [None if e is None else (e.s, e.lateral, e.height) for e in (weld.plan_error, weld.error)]
+    errors = [
+        None if e is None else (broken(e.s, np.flatnonzero(np.diff(e.s) < 0.0) + 1), e.lateral, e.height)
+        for e in (weld.plan_error, weld.error)
+    ]
+    legs = np.flatnonzero(np.diff(log.time[keep]) > NEXT_SEAM_S) + 1
     return WeldTrace(
-        s=named["s_torch"][keep],
+        s=broken(named["s_torch"][keep], legs),
         torch_on=log.torch_on[keep],
         felt=named["phase"][keep] == list(Phase).index(Phase.TRACK),
-        tip=log.p_BTip[keep],
-        torch=log.p_BTorch[keep],
-        robot=log.p_BRobot[keep],
+        tip=broken(log.p_BTip[keep], legs),
+        torch=broken(log.p_BTorch[keep], legs),
+        robot=broken(log.p_BRobot[keep], legs),
         planned=_line(weld.planned),
         true=_line(weld.true_seam),
         plan_error=errors[0],

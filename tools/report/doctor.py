@@ -19,6 +19,10 @@ CHECKED = (
 )  # fmt: skip
 
 
+NOT_ALIKE = ("TCP set at the controller",)
+"""Causes that poses with one orientation cannot show."""
+
+
 @dataclass(frozen=True)
 class NamedCause:
     """A cause as it is printed: its name, confidence 0 to 1, evidence and next step, each a sentence."""
@@ -41,6 +45,12 @@ class DoctorReport:
     causes: tuple[NamedCause, ...]
     n: int
     spread_mm: float | None
+    alike_deg: float | None = None
+
+    @property
+    def checked(self) -> list[str]:
+        """What was looked for and would show."""
+        return [name for name in CHECKED if self.alike_deg is None or name not in (*NOT_ALIKE, "poses too alike")]
 
     def summary(self) -> dict[str, object]:
         """Return the JSON object of `doctor`."""
@@ -50,15 +60,17 @@ class DoctorReport:
             "scans": self.n,
             "causes": [asdict(c) for c in self.causes],
             "spread_mm": self.spread_mm,
-            "checked": list(CHECKED),
+            "checked": self.checked,
+            "alike_deg": self.alike_deg,
         }
 
     def text(self) -> str:
         """Return the printed answer."""
         if not self.causes:
             return (
-                f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(CHECKED)}\n  Where"
-                " new scans still disagree: weldcal verify RESULT NEW_SCANS"
+                f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(self.checked)}\n"
+                + self._not_shown
+                + "  Where new scans still disagree: weldcal verify RESULT NEW_SCANS"
             )
         lines = [
             f"doctor: {len(self.causes)} cause{'s' if len(self.causes) > 1 else ''} in {self.n} scans ({self.source})"
@@ -69,7 +81,17 @@ class DoctorReport:
                 f"     evidence  {c.evidence}",
                 f"     next      {c.next}",
             ]
-        return "\n".join(lines)
+        return "\n".join(lines + ([f"\n{self._not_shown.rstrip()}"] if self._not_shown else []))
+
+    @property
+    def _not_shown(self) -> str:
+        """Return the line on causes that these poses cannot show; empty where they can."""
+        if self.alike_deg is None:
+            return ""
+        return (
+            f"  cannot be seen: {', '.join(NOT_ALIKE)}. The poses differ by only {self.alike_deg:.1f} degrees in"
+            " orientation: turn and tilt the flange by 20 degrees or more between poses, and scan again.\n"
+        )
 
 
 def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
@@ -80,6 +102,7 @@ def worded(source: str, diagnosis: Diagnosis, *, most: int = 3) -> DoctorReport:
         tuple(NamedCause(c.name, round(c.confidence, 3), *_WORDS[c.name](c)) for c in diagnosis.causes[:most]),
         diagnosis.n,
         spread if spread == spread else None,
+        diagnosis.alike_deg if diagnosis.alike_deg == diagnosis.alike_deg else None,
     )
 
 

@@ -4,8 +4,10 @@ It holds the rule of the verdict, every printed form of a pose, and the error of
 """
 
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -140,6 +142,11 @@ class Next:
     command: str = ""
 
 
+def typed(command: str, path: Path | str, *more: str) -> str:
+    """Return a command of weldcal with a path, as a shell takes it."""
+    return " ".join(["weldcal", command, shlex.quote(str(path)), *more])
+
+
 @dataclass(frozen=True, eq=False)
 class ShownPose:
     """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m."""
@@ -227,7 +234,8 @@ def decide(found: Findings) -> tuple[str, str]:
         return CARE, f"{said} But {number.get(found.unseen, f'only {found.unseen} unseen poses back')} it."
     if found.concerns:
         n = len(found.concerns)
-        return CARE, f"{said} But {'one thing' if n == 1 else f'{n} things'} could be wrong, below."
+        joint = "And" if found.tolerance is None else "But"
+        return CARE, f"{said} {joint} {'one thing' if n == 1 else f'{n} things'} could be wrong, below."
     return (CARE, said) if found.tolerance is None else (USE, said)
 
 

@@ -21,6 +21,7 @@ from weldcal.tools.report.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    typed,
     upper,
 )
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, subplots, svg
@@ -82,7 +83,7 @@ class MonitorReport:
             folder = self.out / "recalibrated"
             return Next(
                 "Verify the pose after the change with new scans before you use it.",
-                f"weldcal verify {folder} NEW_SCANS",
+                typed("verify", folder, "NEW_SCANS"),
             )
         if self.moves:
             return Next(

@@ -102,6 +102,7 @@ def paths(trace: WeldTrace) -> bytes:
     """Planned and true seam, tip, torch and robot from above, a detail of the sharpest turn, and the lateral errors."""
     i, j = trace.axes
     drawn = [line for line in (trace.robot, trace.torch, trace.planned, trace.true) if line is not None]
+    drawn = [line[np.isfinite(line).all(axis=1)] for line in drawn]
     reach = np.ptp(np.vstack(drawn), axis=0)
     wide = reach[i] > 1.8 * reach[j]
     if wide:
@@ -244,6 +245,7 @@ def _measure(axes: Axes, trace: WeldTrace) -> None:
     axes.set_ylim(low - 0.12, 1.16)
     _note(axes, "0: the published law divides by zero", 0.02, "bottom")
     through = zero_crossings(s, n)
+    through = through[np.isfinite(through)]
     axes.plot(through, np.zeros(len(through)), "x", color="black", ms=7, mew=1.6)
     for k, at in enumerate(through[:3]):
         text = {
@@ -297,9 +299,10 @@ def _angles(axes: Axes, trace: WeldTrace) -> None:
 
 def _not_steering(axes: Axes, trace: WeldTrace) -> None:
     """Grey where the tip does not steer; a line where the arc was switched on and off."""
+    s = np.where(np.isfinite(trace.s), trace.s, np.roll(trace.s, -1))  # of the gap before another seam
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~trace.felt, [False]]).astype(int)))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        axes.axvspan(1e3 * trace.s[a], 1e3 * trace.s[min(b, len(trace.s) - 1)], color="black", alpha=0.07, lw=0)
+        axes.axvspan(1e3 * s[a], 1e3 * s[min(b, len(s) - 1)], color="black", alpha=0.07, lw=0)
     on = np.flatnonzero(trace.torch_on)
     for k in on[[0, -1]] if len(on) else ():
-        axes.axvline(1e3 * trace.s[k], color="black", lw=0.7, ls=":")
+        axes.axvline(1e3 * s[k], color="black", lw=0.7, ls=":")

@@ -22,6 +22,7 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     Tolerance,
+    typed,
 )
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, known, render, statistics
@@ -76,6 +77,7 @@ class VerifyReport:
     verdict: Verdict
     source: str = ""
     dataset: str = "NEW_SCANS"
+    calibration: str = RESULT_FILE
 
     @property
     def first(self) -> FirstScreen:
@@ -91,7 +93,7 @@ class VerifyReport:
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (correction_note(r, RESULT_FILE),))),
+            notes=tuple(filter(None, (correction_note(r, self.calibration),))),
             settled=settled,
         )
         if len(new):
@@ -112,10 +114,10 @@ class VerifyReport:
         if v.verdict == USE:
             return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
         if v.verdict == DO_NOT:
-            return Next("See what has changed, then calibrate again.", f"weldcal doctor {self.dataset}")
+            return Next("See what has changed, then calibrate again.", typed("doctor", self.dataset))
         if v.verdict == NONE or sum(not p.used_before for p in self.poses) < ENOUGH_UNSEEN:
             return Next("Take four or more new scans across the work space, and verify with them.")
-        return Next("Remove what could be wrong, then verify again.", f"weldcal doctor {self.dataset}")
+        return Next("Remove what could be wrong, then verify again.", typed("doctor", self.dataset))
 
     @property
     def position_error_mm(self) -> dict[str, float]:

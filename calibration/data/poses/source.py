@@ -151,7 +151,7 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
 
 def _no_orphans(orphans: list[str], source: str) -> None:
     if orphans:
-        names = ", ".join(orphans[:5])
+        names = ", ".join(orphans[:5]) + (f" and {len(orphans) - 5} more" if len(orphans) > 5 else "")
         raise DatasetError(
             f"'{source}' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or remove the"
             " cloud."

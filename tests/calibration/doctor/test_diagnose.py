@@ -139,3 +139,20 @@ def test_a_damaged_table_is_refused(tmp_path: Path, old: str, new: str) -> None:
     path.write_text(case_text(clean(SEED)).replace(old, new, 1))
     with pytest.raises(InputError):
         read_case(path)
+
+
+def test_what_poses_of_one_orientation_cannot_show_is_no_all_clear() -> None:
+    case = clean(3)
+    turned = worded("dataset", diagnose(case))
+    assert "cannot be seen" not in turned.text()
+    R = np.repeat(case.X_BF[:1, :3, :3], case.n, axis=0)
+    p = case.X_BF[:, :3, 3]
+    X_BC = pose(np.diag([1.0, -1.0, -1.0]), np.array([0.6, 0.1, 1.0]))
+    seen = inverse(X_BC) @ pose(R, p) @ case.X_FR
+    alike = replace(case, X_BF=pose(R, p), c=seen[:, :3, 3], m=seen[:, :3, 2], guess=None)
+    text = worded("dataset", diagnose(alike)).text()
+    assert "no cause found" in text
+    checked, _, unseen = text.partition("cannot be seen: ")
+    assert "TCP set at the controller" not in checked
+    assert "poses too alike" not in checked
+    assert unseen.startswith("TCP set at the controller. The poses differ by only 0.0 degrees")

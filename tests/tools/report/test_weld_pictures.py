@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform
 from tests.welding.locate.lying import box as solid_box
 from tests.welding.locate.lying import triangles
 from weldcal.models.mesh import TriMesh
+from weldcal.tools.report.demo import broken
 from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, part_in_scan, paths, zero_crossings
 
 N = 120
@@ -103,3 +104,20 @@ def test_a_weld_that_lacks_something_is_still_drawn(lacking: dict[str, object]) 
     weld = replace(trace(), **lacking)  # type: ignore[arg-type]
     for picture in (paths(weld), along_the_weld(weld)):
         assert b"<svg" in picture[:1024]
+
+
+def test_several_seams_are_lines_of_their_own() -> None:
+    one = trace()
+    legs = np.array([N])  # the first row of the second seam
+    twice = {
+        name: np.concatenate([value, value])
+        for name in ("s", "torch_on", "felt", "tip", "torch", "robot", "delta_n", "delta_axial", "speed", "omega")
+        for value in [getattr(one, name)]
+    }
+    for name in ("s", "tip", "torch", "robot"):
+        twice[name] = broken(twice[name], legs)
+    both = replace(one, **twice, n_d_dot_n_t=np.concatenate([one.n_d_dot_n_t] * 2))
+    assert np.isnan(both.s).sum() == 1
+    assert np.isfinite(one.s).all()
+    assert paths(both)
+    assert along_the_weld(both)

@@ -1,7 +1,4 @@
-"""weldcal check-cell: looks at every device of a scenario and says what to do; weldcal tool check: draws a tool.
-
-Nothing moves.
-"""
+"""weldcal check-cell: looks at every device of a scenario and says what to do. Nothing moves."""
 
 import dataclasses as dc
 import inspect
@@ -24,7 +21,7 @@ from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.tools.loading import WELDING, check_sight, load_tool
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.sensors.preflight import Sensed
 from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
@@ -42,8 +39,6 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
 from weldcal.tools.commands.robots import emit_table, state_of
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 from weldcal.welding.finger.deformation import TagModel, detect_tag
 
 LOOKED_AT = tuple(name for name in DEVICES if name not in ("robot", "robot_2"))
@@ -304,17 +299,3 @@ def _computer() -> list[tuple[str, Check]]:
             Check("disk", free >= LEAST_FREE_GB, f"{free:.0f} GB free", "" if free >= LEAST_FREE_GB else action),
         ),
     ]
-
-
-@command("tool check", short_help="Check a tool file and draw the tool.")
-def tool_check(
-    call: Call, file: Annotated[Path, typer.Argument(help="A tool file; models/tools/welding.yaml is one.")]
-) -> Outcome:
-    """Read a tool file, say what was understood of it, and draw it: tool.png and tool.html."""
-    folder = call.folder("tool", file.stem)
-    loaded = load_tool(file)
-    check = ToolCheck(loaded, check_sight(loaded), folder)
-    picture = tool_picture(loaded)
-    write_atomic(folder / "tool.png", picture)
-    write_atomic(folder / "tool.html", tool_report(check, picture))
-    return Outcome(check.summary(), values={}, rows=check.rows())

@@ -44,6 +44,7 @@ from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, 
 from weldcal.tools.commands.cell.screen import MOST_TRIED, joint_of, least_pipe, to_try, unit_hint, ways
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
+from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.run import RunOptions
 
 BASE, EXAMPLE = "s_groove", "calibrate_only"
@@ -144,12 +145,12 @@ def new(
         if not call.json:
             typer.echo("The scans are rendered in simulation, which takes about two minutes.")
         written = write_example(folder, call.seed, call.progress, form)
-        following, note = f"weldcal calibrate {written}", {}
+        following, note = typed("calibrate", written), {}
     else:
         numbers = tuple(edge_numbers(edges))
         own = None if part is None else OwnPart(part, numbers, joint, units)
         written, reason = write_cell(folder, base, own, tool_file(tool_of or WELDING) if tool or tool_of else None)
-        following = f"weldcal demo --scenario {written}"
+        following = typed("demo --scenario", written)
         if part is not None and written.name == UNFINISHED:
             problem = (
                 f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "

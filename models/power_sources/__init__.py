@@ -1,0 +1,1 @@
+"""Register maps of power sources, as YAML."""

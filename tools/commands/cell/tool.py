@@ -1,0 +1,262 @@
+"""weldcal tool check: draws a tool; weldcal tool measure: measures it by scans of a calibrated cell and by touches."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.results import load_result
+from weldcal.calibration.tool.comparison import (
+    EXCEEDED,
+    HOLDS,
+    ToolVerdict,
+    judge_tool,
+    measured_file,
+    tool_text,
+    wire_sigma,
+)
+from weldcal.calibration.tool.measure import Move, NozzlePart, ToolMeasurement, find_ring, measure_tool, tool_scans
+from weldcal.calibration.tool.wire import read_wire_touches
+from weldcal.models.errors import InputError
+from weldcal.models.tools.loading import check_sight, load_tool, tool_file
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import WeldingConfig
+from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
+
+TouchesOption = Annotated[
+    Path | None, option("--touches", "FILE", "Flange poses at which the wire's end touched one point or a plate.")
+]
+CalibrationOption = Annotated[Path | None, option("--calibration", "RESULT", "Result of weldcal calibrate: X_BC.")]
+SeamOption = Annotated[
+    str | None, option("--scenario", "NAME", "Scenario with welding.tolerance_mm.", show_default="the usual tolerance")
+]
+NozzleOption = Annotated[
+    float, option("--nozzle-mm", "MM", "Length of the nozzle that is fitted, from its mouth.", min=15.0, max=300.0)
+]
+WireOption = Annotated[float, option("--wire-mm", "MM", "Diameter of the wire.", min=0.1, max=5.0)]
+NOZZLE_MM, WIRE_MM = 50.0, 1.2  # a usual gas nozzle, and the wire of the shipped tool
+
+
+@command("tool check", short_help="Check a tool file and draw the tool.")
+def tool_check(
+    call: Call,
+    file: Annotated[Path, typer.Argument(help="A tool file; models/tools/welding.yaml is one.")],
+    measure: Annotated[
+        Path | None, option("--measure", "DATASET", "Scans of the tool: say what has moved against the tool file.")
+    ] = None,
+    calibration: CalibrationOption = None,
+    touches: TouchesOption = None,
+    scenario: SeamOption = None,
+    nozzle_mm: NozzleOption = NOZZLE_MM,
+    wire_mm: WireOption = WIRE_MM,
+) -> Outcome:
+    """Read a tool file, say what was understood of it, and draw it: tool.png and tool.html.
+
+    With --measure, say what of the tool has moved, and whether the seam tolerance holds.
+    """
+    if measure is None:
+        if calibration is not None or touches is not None or scenario is not None:
+            raise InputError("--calibration, --touches and --scenario belong to --measure DATASET: name the scans.")
+        folder = call.folder("tool", file.stem)
+        loaded = load_tool(file)
+        check = ToolCheck(loaded, check_sight(loaded), folder)
+        picture = tool_picture(loaded)
+        write_atomic(folder / "tool.png", picture)
+        write_atomic(folder / "tool.html", tool_report(check, picture))
+        return Outcome(check.summary(), values={}, rows=check.rows())
+    if calibration is None:
+        raise InputError("--measure needs --calibration RESULT: the folder that 'weldcal calibrate' wrote.")
+    order = MeasureOrder(
+        dataset=measure,
+        calibration=calibration,
+        tool=file,
+        touches=touches,
+        scenario=scenario,
+        nozzle_mm=nozzle_mm,
+        wire_mm=wire_mm,
+    )
+    report = run_measurement(order, call.folder("tool", file.stem), call.progress)
+    return Outcome(
+        report.summary(),
+        values={},
+        rows=report.rows(),
+        problem="" if report.verdict.tolerance == HOLDS else f"{report.verdict.reason} {report.verdict.cause}".strip(),
+    )
+
+
+@command("tool measure", short_help="Measure the torch by scans and touches.")
+def tool_measure(
+    call: Call,
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="Scans of the tool from several sides, poses X_BF.")
+    ],
+    calibration: Annotated[Path, option("--calibration", "RESULT", "Result of weldcal calibrate: X_BC.")],
+    tool: Annotated[Path, option("--tool", "FILE", "Tool file: where the torch should be, or the name of a tool.")],
+    touches: TouchesOption = None,
+    scenario: SeamOption = None,
+    nozzle_mm: NozzleOption = NOZZLE_MM,
+    wire_mm: WireOption = WIRE_MM,
+) -> Outcome:
+    """Measure nozzle, tip and ring by scans of a calibrated cell and the wire's end by touches.
+
+    The result is a new tool file with the measured torch.
+    """
+    order = MeasureOrder(
+        dataset=dataset,
+        calibration=calibration,
+        tool=tool_file(tool),
+        touches=touches,
+        scenario=scenario,
+        nozzle_mm=nozzle_mm,
+        wire_mm=wire_mm,
+    )
+    report = run_measurement(order, call.folder("tool-measure", dataset.resolve().name), call.progress)
+    return Outcome(report.summary(), values={}, rows=report.rows())
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureOrder:
+    """What the command was given."""
+
+    dataset: Path
+    calibration: Path
+    tool: Path
+    touches: Path | None
+    scenario: str | None
+    nozzle_mm: float
+    wire_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class MeasureReport:
+    """A measured tool, its verdict, the seam's tolerance mm, and the folder of the result."""
+
+    found: ToolMeasurement
+    verdict: ToolVerdict
+    tolerance_mm: float
+    folder: Path
+
+    def summary(self) -> dict[str, Any]:
+        """Return the JSON object: millimetres and degrees in the flange frame."""
+        f = self.found
+        nan = np.isnan(f.stick_out_m)
+        return {
+            "state": "done",
+            "torch": {
+                "xyz_mm": _mm(f.p_FW),
+                "axis": [round(float(v), 7) for v in f.axis],
+                "touched": f.wire is not None,
+                "margin_mm": 1e3 * wire_sigma(f),
+                "covariance_mm2": None if f.wire is None else (1e6 * f.wire.covariance).tolist(),
+                "stick_out_mm": None if nan else 1e3 * f.stick_out_m,
+                "stick_out_sigma_mm": None if nan else 1e3 * f.stick_out_sigma_m,
+            },
+            "nozzle": {
+                "on_axis_mm": _mm(f.p_FN),
+                "covariance": f.axis_covariance.tolist(),
+                "covariance_of": "shifts (m) then turns (rad) along across",
+                "across": f.nozzle.surface.axes[:2].tolist(),
+                "scans": f.nozzle.scans,
+                "noise_mm": 1e3 * f.nozzle.noise_m,
+                "seen_deg": f.seen_deg,
+            },
+            "touches": None
+            if f.wire is None
+            else {"used": f.wire.used, "rms_mm": 1e3 * f.wire.rms_m, "left_out": list(f.wire.left_out)},
+            "moved": {m.part: _moved(m) for m in f.moves},
+            "tolerance_mm": self.tolerance_mm,
+            "tolerance": self.verdict.tolerance,
+            "reason": self.verdict.reason,
+            "cause": self.verdict.cause,
+            "notes": list(f.notes),
+            "tool_file": str(self.folder / "tool.yaml"),
+            "folder": str(self.folder),
+        }
+
+    def rows(self) -> dict[str, str]:
+        """What was found, in lines."""
+        f = self.found
+        rows = {"verdict": self.verdict.reason, "cause": self.verdict.cause}
+        for m in f.moves:
+            turn = (
+                "" if m.turn is None else f", {np.degrees(m.turn_rad):.2f} +- {np.degrees(m.turn_margin_rad):.2f} deg"
+            )
+            said = "moved by" if m.moved else "in its place:"
+            rows[m.part] = f"{said} {1e3 * m.distance_m:.2f} +- {1e3 * m.margin_m:.2f} mm{turn}"
+        if not np.isnan(f.stick_out_m) and f.wire is not None:
+            rows["stick-out"] = f"{1e3 * f.stick_out_m:.1f} +- {2e3 * f.stick_out_sigma_m:.1f} mm"
+        rows["wire point"] = "({:.2f}, {:.2f}, {:.2f}) mm".format(*_mm(f.p_FW))
+        rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
+        return rows | {f"note {k + 1}": note for k, note in enumerate(f.notes)}
+
+
+def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, float], None]) -> MeasureReport:
+    """Measure a tool; write tool.yaml, tool_measurement.json, tool.png and report.html to ``folder``.
+
+    Raises:
+        InputError, ToolNotFound: an input cannot be used, or does not show the torch; nothing is written.
+    """
+    loaded = load_tool(order.tool)
+    calibration = load_result(order.calibration)
+    touches = () if order.touches is None else read_wire_touches(order.touches)
+    welding = WeldingConfig() if order.scenario is None else load_scenario(order.scenario).welding
+    tell("reading the scans", 0.05)
+    data = load_dataset(order.dataset)
+    scans, notes = tool_scans(data, calibration)
+    tell("looking for the ring", 0.2)
+    standard = loaded.tool.ring
+    ring = None if standard is None else find_ring(data, calibration, loaded.tool.X_FR, standard)
+    if standard is not None and ring is None:
+        notes = (*notes, "Fewer than three scans show the ring: it was not measured.")
+    tell("measuring the nozzle", 0.5)
+    found = measure_tool(
+        loaded,
+        scans,
+        calibration.covariance,
+        touches,
+        part=NozzlePart(length_m=1e-3 * order.nozzle_mm),
+        wire_m=1e-3 * order.wire_mm,
+        ring=ring,
+        notes=notes,
+    )
+    report = MeasureReport(found, judge_tool(found, 1e-3 * welding.tolerance_mm), welding.tolerance_mm, folder)
+    tell("writing", 0.9)
+    write_atomic(folder / "tool.yaml", tool_text(found, measured_file(found), str(order.dataset)))
+    picture = tool_picture(load_tool(folder / "tool.yaml"))
+    write_atomic(folder / "tool.png", picture)
+    tone: Mapping[str, str] = {HOLDS: "good", EXCEEDED: "bad"}
+    page = render(
+        "tool_measurement.html.j2",
+        name=loaded.name,
+        file=order.tool.name,
+        tone=tone.get(report.verdict.tolerance, "warn"),
+        headline=f"The seam tolerance {report.verdict.tolerance}",
+        verdict_text=f"{report.verdict.reason} {report.verdict.cause}".strip(),
+        rows=[row for row in report.rows().items() if row[0] not in ("verdict", "cause")],
+        picture=picture,
+    )
+    write_atomic(folder / "report.html", page)
+    write_json(folder / "tool_measurement.json", report.summary())
+    return report
+
+
+def _mm(p: Any) -> list[float]:
+    return [round(1e3 * float(v), 4) + 0.0 for v in p]
+
+
+def _moved(m: Move) -> dict[str, object]:
+    return {
+        "moved": m.moved,
+        "by_mm": 1e3 * m.distance_m,
+        "shift_mm": _mm(m.shift),
+        "margin_mm": 1e3 * m.margin_m,
+        "turned_deg": None if m.turn is None else float(np.degrees(m.turn_rad)),
+        "turn_margin_deg": None if m.turn is None else float(np.degrees(m.turn_margin_rad)),
+    }
