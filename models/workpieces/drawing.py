@@ -303,9 +303,11 @@ def _nothing(sections: list[Section], joint: str, points: Floats) -> str:
         return f"The seam's line is off the part: {where} nothing of it lies within 25 mm; check the line and its unit."
     if not seen:
         return f"The seam's line does not run along an edge of the part: {where} it meets no two walls within 4 mm."
+    opens, outside = float(np.median(seen)), OPENINGS_DEG["butt"][1]
+    advice = " An outside corner as wide as this cannot be welded: weld its inside." if opens > outside else ""
     return (
-        f"The line does not run along a {joint} joint: the free space {where} opens {np.median(seen):.0f} deg, and a"
-        f" {joint} has {low:.0f} to {high:.0f} deg."
+        f"The line does not run along a {joint} joint: the free space {where} opens {opens:.0f} deg, and a"
+        f" {joint} has {low:.0f} to {high:.0f} deg.{advice}"
     )
 
 

@@ -79,9 +79,12 @@ def _bounded(path: Path, units: str | None) -> PartShape:
     if isinstance(found, InputError):
         raise found
     if not isinstance(found, PartShape):
+        lighter = "without threads, holes and purchased parts"
+        if path.suffix.lower() in MESH_SUFFIXES:
+            lighter = f"as a STEP file or with fewer triangles, {lighter}"
         raise InputError(
             f"'{path.name}' cannot be read within {MOST_S} s of processor time: it has too many faces, or damaged "
-            "ones. Export only the bodies that are welded, without threads, holes and purchased parts."
+            f"ones. Export only the bodies that are welded, {lighter}."
         )
     return found
 

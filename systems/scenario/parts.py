@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.models.arms.kinematics import ArmModel, load_arm, mounted, with_link_transforms
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.workpieces.drawing import resampled
 from weldcal.models.workpieces.mesh_files import read_surface
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.reading import MESH_SUFFIXES, read_shape
-from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.seam_input import SeamSource, chained, seam_of
 from weldcal.models.workpieces.seams import JOINTS, DrawnSeam
-from weldcal.models.workpieces.shape import UNITS_M, PartShape
+from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartShape
 from weldcal.systems.scenario.schema import ObstacleConfig, Scenario, SeamConfig, WorkpieceConfig
 
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")
@@ -143,30 +145,51 @@ def legs(shape: PartShape, source: SeamSource, joint: str) -> list[DrawnSeam]:
     Raises:
         InputError: as seam_of.
     """
-    whole, ids = seam_of(shape, source, joint), list(source.edges)
-    up, t = whole.up_P, whole.tangents_P
-    angle = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
-    # at an outside corner the seam turns away from the side to which the joint is open
-    after, before = (np.clip(np.arange(len(angle)) + k, 0, len(t) - 1) for k in (3, -2))
-    outside = np.sum((t[after] - t[before]) * (up[1:] + up[:-1]), axis=1) < 0.0
-    corners = whole.points_P[np.flatnonzero((angle > CORNER_RAD) & outside)]
+    ids = list(source.edges)
+    turns = [joint == "butt" and _turn(shape.edge(a), shape.edge(b)) for a, b in pairwise(ids)]
+    if any(turns):  # around the corner of a tube the faces of a butt are level in each leg only
+        line = resampled(chained(shape, ids)[0], None, closed=False)[0]
+        line = line if source.direction == "forward" else line[::-1]
+        t = np.gradient(line, axis=0)
+    else:
+        whole = seam_of(shape, source, joint)
+        line, t, corners = whole.points_P, whole.tangents_P, _outside_corners(whole)
+        turns = [_near(shape.edge(a), shape.edge(b), corners) for a, b in pairwise(ids)]
+        if not any(turns):
+            return [whole]
     groups = [ids[:1]]
-    for k, id in enumerate(ids[1:], start=1):
-        ends = shape.edge(id).points_P[[0, -1]]
-        meet = ends[
-            int(np.argmin(np.linalg.norm(ends[:, None] - shape.edge(ids[k - 1]).points_P[[0, -1]], axis=2).min(axis=1)))
-        ]
-        sharp = len(corners) and np.linalg.norm(corners - meet, axis=1).min() < ROUNDED_M
-        groups = [*groups, [id]] if sharp else [*groups[:-1], [*groups[-1], id]]
-    if len(groups) == 1:
-        return [whole]
+    for id, turn in zip(ids[1:], turns, strict=True):
+        groups = [*groups, [id]] if turn else [*groups[:-1], [*groups[-1], id]]
     found = []
     for group in groups if source.direction == "forward" else groups[::-1]:
         leg = seam_of(shape, SeamSource(edges=tuple(group)), joint)
-        near = int(np.argmin(np.linalg.norm(whole.points_P - leg.points_P[len(leg.points_P) // 2], axis=1)))
+        near = int(np.argmin(np.linalg.norm(line - leg.points_P[len(leg.points_P) // 2], axis=1)))
         found.append(leg if leg.tangents_P[len(leg.points_P) // 2] @ t[near] > 0.0 else leg.reversed())
     found[0] = found[0].between(source.start_m, found[0].length_m)
     return [*found[:-1], found[-1].between(0.0, found[-1].length_m - source.end_m)]
+
+
+def _turn(a: PartEdge, b: PartEdge) -> bool:
+    """Return whether the joints at two straight edges open in different directions."""
+    if a.up_P is None or b.up_P is None or not len(a.points_P) == len(b.points_P) == 2:
+        return False
+    return float(a.up_P @ b.up_P) < math.cos(CORNER_RAD)
+
+
+def _near(a: PartEdge, b: PartEdge, corners: NDArray[np.float64]) -> bool:
+    """Return whether one of the corners (N,3) lies where an edge meets another."""
+    ends = b.points_P[[0, -1]]
+    meet = ends[int(np.argmin(np.linalg.norm(ends[:, None] - a.points_P[[0, -1]], axis=2).min(axis=1)))]
+    return len(corners) > 0 and bool(np.linalg.norm(corners - meet, axis=1).min() < ROUNDED_M)
+
+
+def _outside_corners(seam: DrawnSeam) -> NDArray[np.float64]:
+    """Points (N,3) where a seam turns away from the side to which its joint is open."""
+    up, t = seam.up_P, seam.tangents_P
+    angle = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
+    after, before = (np.clip(np.arange(len(angle)) + k, 0, len(t) - 1) for k in (3, -2))
+    outside = np.sum((t[after] - t[before]) * (up[1:] + up[:-1]), axis=1) < 0.0
+    return np.asarray(seam.points_P[np.flatnonzero((angle > CORNER_RAD) & outside)])
 
 
 def made(part: Part, spec: WorkpieceConfig, rng: np.random.Generator) -> Part:

@@ -172,3 +172,23 @@ def test_a_part_lies_off_by_its_middle_and_not_by_the_origin_of_its_file(cell: P
         assert np.degrees(turned.ToAngleAxis().angle()) == pytest.approx(1.5)
     finally:
         station.close()
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_a_butt_around_a_tube_is_welded_leg_by_leg(direction: str, tmp_path: Path) -> None:
+    """Its faces are level in each leg only."""
+    tubes = [less(box((x, 0, 0), (100, 40, 60)), box((x - 1, 3, 3), (102, 34, 54))) for x in (0, 101)]
+    write_step(assembly(*tubes), tmp_path / "tubes.step")
+    joint = max(read_shape(tmp_path / "tubes.step").joints, key=lambda j: j.length_m)
+    seam = SeamConfig(edges=list(joint.edges), direction=direction, start_mm=5.0, end_mm=10.0)
+    part = part_of(WorkpieceConfig(file=str(tmp_path / "tubes.step"), seams=[seam], joint="butt"))
+    assert seam_count(part) == 4
+    legs = [numbered(part, k) for k in range(4)]
+    ends = 1e3 * np.array([leg.seam_P[[0, -1]] for leg in legs])
+    assert ends[..., 0] == pytest.approx(np.full((4, 2), 100.5), abs=0.01)  # the middle of the gap
+    assert ends[1:, 0] == pytest.approx(ends[:-1, 1], abs=0.1)
+    assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() == pytest.approx(2 * (40 + 60) - 15, abs=0.5)
+    assert np.linalg.norm(ends[0, 0] - ends[-1, 1]) == pytest.approx(np.hypot(5.0, 10.0), abs=0.5)
+    for leg in legs:
+        outwards = leg.seam_P[len(leg.seam_P) // 2] - [0.1005, 0.02, 0.03]
+        assert leg.up_P[0] @ outwards > 0.015

@@ -27,8 +27,8 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
 from weldcal.tools.commands.cell.part import edges_picture, with_plans
-from weldcal.tools.commands.cell.screen import Seam, ranked
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
+from weldcal.tools.commands.cell.screen import Seam, ranked, ways
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, prism, write_step
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +170,46 @@ def test_pieces_are_named_with_the_reason_of_their_own_seam(tmp_path: Path, monk
     monkeypatch.setattr(new, "add_scan_poses", only_the_second_in_pieces)
     monkeypatch.setattr(new, "weldable_place", lambda scenario, advises: (scenario.workpiece.pose_guess, ""))
     _, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
-    assert note.startswith("Without the short edges")
+    assert re.match(r"Without edges \d+, \d+, which are shorter", note)
     assert note.endswith(f"As a whole: Whole {min(second.edges)}.")
+
+
+def test_the_edge_below_a_tube_is_left_out(tmp_path: Path) -> None:
+    """Two tubes end to end: of the butt around them the arm reaches all but the edge that lies on the table."""
+    tubes = [less(box((x, 0, 0), (100, 40, 40)), box((x - 1, 3, 3), (102, 34, 34))) for x in (0, 101)]
+    write_step(assembly(*tubes), tmp_path / "tubes.step")
+    shape = read_shape(tmp_path / "tubes.step")
+    ring = max(shape.joints, key=lambda joint: joint.length_m)
+    (below,) = (id for id in ring.edges if np.abs(shape.edge(id).points_P[:, 2]).max() < 1e-6)
+    (_, _), (pieces, note), *_ = ways(shape, ring.edges)
+    assert [seam.edges for seam in pieces] == [[id] for id in ring.edges if id != below]
+    assert note == f"Without edges {below}, which are shorter than 20 mm or open downwards."
+
+
+def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    bevel = [(0, 0, 0), (0, 8, -8)]
+    plates = [
+        prism([*bevel, (0, 100, -8), (0, 100, 0)], (150, 0, 0)),
+        prism([*bevel, (0, 8, -80), (0, 0, -80)], (150, 0, 0)),
+    ]
+    write_step(assembly(*plates), tmp_path / "mitre.step")
+    words = ["part", str(tmp_path / "mitre.step"), "--plan", "0", "--out", str(tmp_path / "out")]
+    assert "is not listed and cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
+    shape = read_shape(tmp_path / "mitre.step")
+    outside = next(edge.id for edge in shape.edges if np.abs(edge.points_P[:, 1:]).max() < 1e-9)
+    with pytest.raises(InputError, match=r"opens 270 deg, .* cannot be welded: weld its inside\."):
+        seam_of(shape, SeamSource(edges=(outside,)), "fillet")
+
+
+def test_after_a_minute_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = read_shape(step)
+    monkeypatch.setattr(new, "_refused", lambda *_: "")
+    seams = ranked(shape, load_tool(WELDING).tool)
+    for most, count in ((60.0, 2), (0.0, 1)):
+        monkeypatch.setattr(new, "MOST_PLANNING_S", most)
+        monkeypatch.setattr(new, "process_time", iter((0.0, 0.0, 1.0)).__next__)
+        found = with_plans(shape, seams, 10, step, None, WELDING, lambda stage, share: None)
+        assert [seam.planned for seam in found] == [True] * count + [False] * (2 - count)
 
 
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:

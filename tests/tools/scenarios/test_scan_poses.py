@@ -115,7 +115,7 @@ def test_a_scanner_beside_the_arm_that_shows_too_little_names_the_other_cell(tmp
     written, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(write_beam(tmp_path)))
     assert written.name == "unfinished.yaml"
     assert "The part is 1.5 m long, and the scanner beside the arm shows 0.82 m of it" in reason
-    assert "add --from carried_scanner" in reason
+    assert "new FOLDER --part FILE --from carried_scanner" in reason
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import process_time
 from typing import Annotated, Any
 
 import numpy as np
@@ -97,6 +98,7 @@ TOOL = "tool.yaml"
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
+MOST_PLANNING_S = 60.0  # of processor time for the seams of a part: a choice, a user waits no longer
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
@@ -270,9 +272,9 @@ def _refused(
 def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[tuple[str, str]]:
     """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried, else "".
 
-    And in which pieces it can; "" where it can as a whole.
+    And in which pieces it can; "" where it can as a whole. After MOST_PLANNING_S the rest of the seams is not asked.
     """
-    found = []
+    found, began = list[tuple[str, str]](), process_time()
     with TemporaryDirectory() as folder:
         scenario = load_scenario(BASE)
         first, shape = dc.replace(part, edges=tuple(edge.id for edge in seams[0])), read_shape(part.file, part.units)
@@ -281,6 +283,8 @@ def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Pr
         assert scenario.workpiece is not None
         standing = scenario.workpiece.pose_guess
         for k, edges in enumerate(seams):
+            if process_time() - began > MOST_PLANNING_S:
+                break
             progress(f"plan seam {k + 1} of {len(seams)}", 0.3 + 0.6 * k / len(seams))
             reason = ""
             for tried, pieces in ways(shape, [edge.id for edge in edges])[:3]:

@@ -23,7 +23,7 @@ from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.commands.cell.new import OwnPart, planned
-from weldcal.tools.commands.cell.screen import Seam, ranked, unit_hint
+from weldcal.tools.commands.cell.screen import Seam, outside_hint, ranked, unit_hint
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
 
@@ -49,7 +49,12 @@ def part(
         Path, option("--tool", "FILE", "Tool that has to fit the seams.", show_default="the shipped one")
     ] = WELDING,
     plan: Annotated[
-        int, option("--plan", "N", "Seams that the tool fits for which the arm's way is planned, the best first.")
+        int,
+        option(
+            "--plan",
+            "N",
+            "Seams that the tool fits for which the arm's way is planned, the best first, for about a minute.",
+        ),
     ] = MOST_PLANNED,
 ) -> Outcome:
     """List the seams and the edges of a part with their numbers, for workpiece.seams in a scenario, and draw them."""
@@ -76,10 +81,11 @@ def with_plans(
     found = [
         replace(seam, reason=reason, pieces=pieces, planned=True)
         for seam, (reason, pieces) in zip(
-            asked, planned(OwnPart(file, units=units), lines, tool, progress), strict=True
+            asked, planned(OwnPart(file, units=units), lines, tool, progress), strict=False
         )
     ]
-    return sorted([*found, *(seam for seam in seams if seam not in asked)], key=lambda seam: bool(seam.reason))
+    rest = [seam for seam in seams if seam not in asked[: len(found)]]
+    return sorted([*found, *rest], key=lambda seam: bool(seam.reason))
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:
@@ -135,7 +141,7 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         typer.echo(
             "No seams are listed: no two bodies meet within 3 mm in a concave joint, and no body has a concave edge."
         )
-    if hint := unit_hint(shape):
+    for hint in filter(None, (outside_hint(shape), unit_hint(shape))):
         typer.echo(hint)
     pick = "Pick by number in the scenario, workpiece.seams: [{edges: [ID, ...]}]. " if seams else ""
     typer.echo(f"{pick}Picture: {folder / 'report.html'}")

@@ -79,7 +79,8 @@ def _too_long(scenario: Scenario, station: Station) -> str:
     shown = max(scanner.scanner().footprint_m(away))
     size = _lying(cad.mesh.transformed(X_BP), station.arm.up)[1][0]
     words = f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it"
-    return "" if size <= shown else f"{words}. Let the arm carry the scanner along the part: add --from {CARRIED}."
+    advice = f"Let the arm carry the scanner along the part: weldcal new FOLDER --part FILE --from {CARRIED}."
+    return "" if size <= shown else f"{words}. {advice}"
 
 
 def _part(scenario: Scenario, station: Station) -> tuple[WeldPart, RigidTransform]:

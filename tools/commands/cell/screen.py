@@ -164,6 +164,14 @@ def unit_hint(shape: PartShape) -> str:
     return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
 
 
+def outside_hint(shape: PartShape) -> str:
+    """Return what a part asks whose corners are listed inside only, as those of a mitre; "" for any other."""
+    sides = [joint.side for joint in shape.joints if joint.type == "corner"]
+    if sides.count("inside") <= sides.count("outside"):
+        return ""
+    return "The outside of a corner that opens more than 180 deg is not listed and cannot be welded: weld its inside."
+
+
 def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
     """A seam along edges as a whole, and what it may be welded in: a ring in pieces that overlap, another edge by edge.
 
@@ -188,11 +196,17 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
         found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}"))
         return found
     by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
-    long = [id for id in ids if shape.edge(id).length_m > SHORT_M]
-    if 1 < len(long) < len(ids):
-        without = f"Without the short edges {', '.join(str(id) for id in ids if id not in long)}."
-        found.append(([SeamConfig(edges=[id]) for id in long], without))
+    within = [id for id in ids if shape.edge(id).length_m > SHORT_M and not _below(shape.edge(id))]
+    if 1 < len(within) < len(ids):
+        left_out = ", ".join(str(id) for id in ids if id not in within)
+        without = f"Without edges {left_out}, which are shorter than {1e3 * SHORT_M:.0f} mm or open downwards."
+        found.append(([SeamConfig(edges=[id]) for id in within], without))
     return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {named}.") for id in by_length]
+
+
+def _below(edge: PartEdge) -> bool:
+    """Return whether a joint opens downwards as the part is drawn, where no arm reaches it."""
+    return edge.up_P is not None and float(edge.up_P[2]) < -OPEN_ABOVE
 
 
 def joint_of(edge: PartEdge) -> str:
