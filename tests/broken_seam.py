@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 
 from weldcal.systems.jobs.weld.progress_keeper import EVERY_M, felt_points
-from weldcal.systems.jobs.weld.seam_planner import RUN_UP_S
+from weldcal.systems.jobs.weld.seam_planning import RUN_UP_S
 from weldcal.tools.worlds.weld import plant
 from weldcal.tools.worlds.weld.budgets import BUDGETS, NOMINAL, Budget, planned_seam
 from weldcal.tools.worlds.weld.plant import StudyRun, simulate

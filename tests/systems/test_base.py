@@ -14,7 +14,7 @@ from weldcal.calibration.planning.clearance import arm_bodies, lowest_point
 from weldcal.models.arms.kinematics import link_frames, load_arm, mounted
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.jobs.weld.seam_planner import plan_root_anyhow
+from weldcal.systems.jobs.weld.seam_planning import plan_root_anyhow
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station, table_in_base
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan

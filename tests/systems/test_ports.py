@@ -87,7 +87,8 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     IterativeCalibrator,
     PoseRequest,
 )
-from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.systems.leaf_system import LeafSystem

@@ -11,7 +11,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import Part
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.seam_planner import UNFELT
+from weldcal.systems.jobs.weld.seam_planning import UNFELT
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words

@@ -20,7 +20,8 @@ from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibrationPosePlanner, IterativeCalibrator
-from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
     calibrator_config,

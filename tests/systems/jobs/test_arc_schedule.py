@@ -13,7 +13,7 @@ from tests.welding.locate.lying import FLOOR, TABLE, box, looking, pose, put, sc
 from tests.welding.locate.test_fit_up import drawn
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
-from weldcal.systems.jobs.weld.seam_planner import planned_gap
+from weldcal.systems.jobs.weld.seam_planning import planned_gap
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, at_gap
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.loading import load_scenario

@@ -23,7 +23,7 @@ from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_clearance
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam, seam_above
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, seam_above
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.checks import check_scenario

@@ -16,7 +16,8 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background import Answer
 from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, arm_waypoints
-from weldcal.systems.jobs.weld.seam_planner import SeamPlanner, SeamPlanning, plan_drawn_seam, tip_seam
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanner
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, tip_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
 from weldcal.systems.motion.buffers import PoseHistory

@@ -30,8 +30,8 @@ from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seat import JointNotWeldable, Press
 from weldcal.models.workpieces.shape import PartShape
-from weldcal.systems.jobs.weld import seam_planner
-from weldcal.systems.jobs.weld.seam_planner import (
+from weldcal.systems.jobs.weld import seam_planning
+from weldcal.systems.jobs.weld.seam_planning import (
     SeamPlanning,
     UncertainSeam,
     added_variance,
@@ -256,7 +256,7 @@ def test_a_fresh_cells_first_plan_lies_within_its_sigma(monkeypatch: pytest.Monk
     def along_itself(*given: Any) -> RootPlan:
         return replace(plan_root_anyhow(*given), sigma_m=8e-3)
 
-    monkeypatch.setattr(seam_planner, "plan_root_anyhow", along_itself)
+    monkeypatch.setattr(seam_planning, "plan_root_anyhow", along_itself)
     rng = np.random.default_rng(62)
     X = lying_pose((0.65, 0.0, 0.008), (0.0, 0.0, 0.5 * math.pi))
     X_BC = looking(np.array([0.65, 0.0, 0.95]), X[:3, 3])

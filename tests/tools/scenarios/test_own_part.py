@@ -13,7 +13,7 @@ from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.tools.loading import WELDING
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.loading import load_scenario

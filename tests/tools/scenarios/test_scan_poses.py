@@ -15,7 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import extrude
 from weldcal.models.scanners import cast, get_scanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_seam
+from weldcal.systems.jobs.weld.seam_planning import plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView
 from weldcal.systems.scenario.loading import load_scenario

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario

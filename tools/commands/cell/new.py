@@ -30,7 +30,7 @@ from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam, plan_seam
+from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import Scan
 from weldcal.systems.runner import Progress, no_progress

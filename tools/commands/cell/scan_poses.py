@@ -19,7 +19,7 @@ from weldcal.models.scanners import ScannerPreset, cast
 from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam, plan_seam
+from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import clear_scan_move, servo_config
 from weldcal.systems.messages import Scan, ScanView
 from weldcal.systems.scenario.loading import load_scenario
