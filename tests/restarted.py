@@ -29,7 +29,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.operator import Operator
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.broken_weld import keeper_of, restarting
+from weldcal.tools.commands.weld import keeper_of, restarting
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import weld_outcome

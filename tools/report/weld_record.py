@@ -7,14 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.runner import Run
 from weldcal.tools.report.files import mappings_csv, write_json
-from weldcal.tools.report.plots_record import arc_over_time
+from weldcal.tools.report.pictures import GREY, OURS, TORCH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
@@ -33,6 +35,54 @@ from weldcal.welding.record.welded_seam import (
     welded_seam,
 )
 from weldcal.welding.servo.state import Phase
+
+_SMALL = 8
+_INCH = 1.35  # height of one curve
+_SMOOTH_S = 0.2  # a choice: a reader's eye takes the mean of a pulsed or noisy arc
+
+
+def arc_over_time(record: WeldRecord, rows: NDArray[np.bool_], limits: OrderLimits) -> bytes | None:
+    """Draw current, voltage, wire feed, travel speed and gap while the arc of these rows (N,) burns; None without one.
+
+    Measured values are lines, set values dashed, limits grey bands.
+    """
+    on = np.flatnonzero(rows & record.arc)
+    if len(on) < 3:
+        return None
+    t = record["time_s"][on] - record["time_s"][on[0]]
+    curves = [
+        ("current, A", record["current_A"][on], record["set_current_A"][on], limits.current_A),
+        ("voltage, V", record["voltage_V"][on], record["set_voltage_V"][on], limits.voltage_V),
+        ("wire feed,\nm/min", None, record["set_wire_feed_m_min"][on], None),
+        ("travel speed,\nmm/s", 1e3 * record["torch_speed_m_s"][on], None, limits.speed_mm_s),
+        ("gap, mm", 1e3 * record["gap_m"][on], None, None),
+    ]
+    shown = [c for c in curves if any(v is not None and np.isfinite(v).any() for v in c[1:3])]
+    figure, axes = subplots(8.2, _INCH * len(shown) + 0.3, len(shown), 1, sharex=True, squeeze=False)
+    for ax, (name, measured, wanted, limit) in zip(axes[:, 0], shown, strict=True):
+        if limit is not None:
+            ax.axhspan(*limit, color=GREY, alpha=0.18, lw=0, label="limits")
+        if measured is not None and np.isfinite(measured).any():
+            ax.plot(t, measured, color=GREY, lw=0.5)
+            ax.plot(t, _smooth(t, measured), color=OURS, lw=1.3, label="measured")
+        if wanted is not None and np.isfinite(wanted).any():
+            ax.plot(t, wanted, color=TORCH, lw=1.2, ls="--", label="set")
+        low, high = ax.get_ylim()
+        ax.set_ylim(min(low, 0.0) if name.startswith(("travel", "gap")) else low, high)
+        ax.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="lower center")
+        plain(ax, "", name)
+    axes[-1, 0].set_xlabel("time from the established arc, s")
+    return svg(figure, *axes[:, 0])
+
+
+def _smooth(t: Array, value: Array) -> Array:
+    """The running mean (N,) over _SMOOTH_S."""
+    known = np.nan_to_num(value)
+    total = np.concatenate([[0.0], np.cumsum(known)])
+    first = np.searchsorted(t, t - 0.5 * _SMOOTH_S)
+    last = np.searchsorted(t, t + 0.5 * _SMOOTH_S, side="right")
+    return np.asarray((total[last] - total[first]) / (last - first))
+
 
 RECORD_HTML, RECORD_JSON, RECORD_CSV, PICTURES = "record.html", "record.json", "record.csv", "pictures"
 PHASE_NAMES = [str(phase) for phase in Phase]

@@ -1,4 +1,4 @@
-"""Checks that the tool has room at the part: its body along the whole seam, tip and torch beyond its ends."""
+"""Check that the tool fits at the part: its body along the whole seam, tip and torch beyond its ends."""
 
 import math
 from collections.abc import Sequence
@@ -222,7 +222,7 @@ def _free_length(triangles: NDArray[np.float64], frame: SeamFrame, sign: float, 
 
 
 def _large(triangles: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """(M,) whether a triangle is so large that its corners do not tell where it passes."""
+    """(M,) whether a triangle is so large that its corners do not show where it passes."""
     return np.asarray(np.ptp(triangles, axis=1).max(axis=1) > 0.5 * reach)
 
 

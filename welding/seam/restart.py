@@ -63,8 +63,8 @@ class Restart:
         limit = max(MOVED_M, SURE * math.hypot(*np.nan_to_num([self.sigma_m, sigma_m])))
         if most > limit:
             raise PartMoved(
-                f"The part was moved by {1e3 * most:.1f} mm since it was welded (limit {1e3 * limit:.1f} mm), so the weld"
-                " does not go on. Put the part back, or weld the rest by hand."
+                f"The part was moved by {1e3 * most:.1f} mm since it was welded (limit {1e3 * limit:.1f} mm). Put the"
+                " part back, or weld the rest by hand."
             )
 
     def cut(self, seam: SeamCurve, chord_m: float, run_up_m: float, window_m: float, from_m: float = 0.0) -> "CutSeam":

@@ -34,9 +34,8 @@ from weldcal.systems.phase_words import (
 )
 from weldcal.systems.viewer.live import LiveView, Moment
 from weldcal.tools.dashboard.facts import Facts
-from weldcal.tools.dashboard.picture import depth_picture
 from weldcal.tools.dashboard.server import Dashboard
-from weldcal.tools.dashboard.source import DashboardSource
+from weldcal.tools.dashboard.source import DashboardSource, depth_picture
 
 FIT = FlangeFit(
     center_C=np.array([0.02, -0.03, 0.7]),

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.motion.clock import STUDY, cases
+from weldcal.tools.studies.motion.throughput import STUDY, cases
 from weldcal.tools.worlds.moves import cube_moves, exact_errors, observed_frames
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.motion.whole_body import run_whole_body
+from weldcal.tools.studies.motion.throughput import run_whole_body
 from weldcal.tools.worlds.motion import MotionOptions
 
 

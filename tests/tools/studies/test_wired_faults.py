@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.tools.emulators.cell.bridges import Bridge, PictureBridge, ScannerBridge
+from weldcal.tools.emulators.cell.process import Bridge, PictureBridge, ScannerBridge
 from weldcal.tools.emulators.cell.wires import DELAY_S, InputWire
 from weldcal.tools.studies.robot.wired import FLAT_MB_H, grows, growth
 from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, PHASES, Happening

@@ -14,8 +14,7 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.report.plots_record import arc_over_time
-from weldcal.tools.report.weld_record import PartRecord
+from weldcal.tools.report.weld_record import PartRecord, arc_over_time
 from weldcal.welding.record.order import OrderLimits, WeldOrder, WeldOrderError
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.weld_log import NAMES, WeldRecord, load_weld_log, weld_log_texts
