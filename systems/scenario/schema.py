@@ -287,7 +287,9 @@ class WeldingConfig:
     pass_obstacles: bool = False
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
-    law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
+    # steering law: guarded; of the paper, for comparison: printed, literal (sign corrected), open (fitted normal, no
+    # feedback), fixed (with feedback), fixed_zeroed, dls (damped division); see welding/servo/laws.py
+    law: str = "guarded"
 
     def tacks_m(self) -> list[tuple[int, float, float, float]]:
         """The tacks: number of the seam, from 0, start and end along it, and height over its root, m."""
