@@ -146,6 +146,8 @@ class PartRecord:
             limit = _limit(self.order, name)
             verdict = "" if limit == "–" else "outside" if name in outside else "within"
             mean = fixed(_spread(seam, name).mean, digits)
+            if mean == limit == "–":  # neither known nor ordered
+                continue
             found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
         return found
 
