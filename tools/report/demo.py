@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
@@ -34,7 +33,7 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
-from weldcal.tools.report.plots_weld import WeldTrace
+from weldcal.tools.report.plots_weld import NEXT_SEAM_S, WeldTrace, broken
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import (
@@ -436,16 +435,6 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     plain(axes, "scans used", "error, mm")
     picture.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     return svg(picture)
-
-
-NEXT_SEAM_S = 0.5  # a choice: rows of one seam are 8 ms apart, and between two seams the arm goes home
-
-
-def broken(values: Array, at: NDArray[np.intp]) -> Array:
-    """Return a copy (N, ...) with NaN in the rows ``at``: a line that is drawn through it has a gap there."""
-    found = np.array(values, dtype=float)
-    found[at] = np.nan
-    return found
 
 
 def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:

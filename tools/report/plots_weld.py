@@ -98,6 +98,16 @@ def part_in_scan(points_B: Array, mesh: TriMesh, X_BP: RigidTransform) -> bytes:
     return svg(picture, *panes)
 
 
+NEXT_SEAM_S = 0.5  # a choice: rows of one seam are 8 ms apart, and between two seams the arm goes home
+
+
+def broken(values: Array, at: NDArray[np.intp]) -> Array:
+    """Return a copy (N, ...) with NaN in the rows ``at``: a line that is drawn through it has a gap there."""
+    found = np.array(values, dtype=float)
+    found[at] = np.nan
+    return found
+
+
 def paths(trace: WeldTrace) -> bytes:
     """Planned and true seam, tip, torch and robot from above, a detail of the sharpest turn, and the lateral errors."""
     i, j = trace.axes

@@ -14,8 +14,7 @@ from pydrake.math import RigidTransform
 from tests.welding.locate.lying import box as solid_box
 from tests.welding.locate.lying import triangles
 from weldcal.models.mesh import TriMesh
-from weldcal.tools.report.demo import broken
-from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, part_in_scan, paths, zero_crossings
+from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, broken, part_in_scan, paths, zero_crossings
 
 N = 120
 S = np.linspace(-0.06, 0.2, N)
