@@ -390,11 +390,9 @@ ALIKE_DEG = 3.0  # as in the warning of calibrate: orientations closer than this
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The causes, likeliest first.
+    """The causes, likeliest first, the number of scans, and the spread (m) of their centres about the best explanation.
 
-    The number of scans, and the spread (m) of their centres about what explains them best.
-    ``alike_deg``: the largest rotation between poses that hardly differ in orientation, which show no wrong TCP (NaN:
-    they differ).
+    ``alike_deg``: the largest rotation between poses of nearly one orientation, which show no wrong TCP; else NaN.
     """
 
     causes: tuple[Cause, ...]
@@ -427,16 +425,8 @@ def diagnose(case: DoctorCase) -> Diagnosis:
         reading = best_reading(bare, fit(bare))
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
-            causes.append(
-                Cause(
-                    reading.cause,
-                    0.99,
-                    1e6 + null.bic - reading.fit.bic,
-                    _residuals(null, reading.fit),
-                    (),
-                    reading.words,
-                )
-            )
+            score = 1e6 + null.bic - reading.fit.bic
+            causes.append(Cause(reading.cause, 0.99, score, _residuals(null, reading.fit), (), reading.words))
             case = with_arm_errors(reading.case)
             null = fit(case)
             models = _ranked(case, null)
@@ -461,8 +451,8 @@ def diagnose(case: DoctorCase) -> Diagnosis:
         causes = [left]
     causes.sort(key=lambda c: -c.score)
     turned = turn_deg([as_transform(X) for X in case.X_BF]) if case.oriented else 0.0
-    alike = turned if turned < ALIKE_DEG else float("nan")
-    return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))), alike)
+    spread = float(np.median(np.linalg.norm(best.e, axis=1)))
+    return Diagnosis(tuple(causes), case.n, spread, turned if turned < ALIKE_DEG else float("nan"))
 
 
 def _ranked(case: DoctorCase, null: CauseFit) -> list[Explained]:

@@ -210,10 +210,10 @@ def verify_dataset(
     """Verify a calibration on a dataset folder; write verification.json and report.html.
 
     The calibration is its folder or calibration.yaml, or any file with a pose. Errors are taken at the flange centre,
-    in the base, after the result's scanner correction. A scan in which no flange is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
-    overrides dataset.yaml; the fits follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that
-    follows from what the calibration states. ``pose`` names the pose in a file of several. Nothing is written unless at
-    least one scan can be used.
+    in the base, after the result's scanner correction. A scan in which no flange is found is named and not used.
+    Without ``correct_scanner`` the result's correction is not applied. ``flange`` overrides dataset.yaml; the fits
+    follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what the calibration
+    states. ``pose`` names the pose in a file of several. Nothing is written unless at least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.
