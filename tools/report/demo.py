@@ -389,7 +389,7 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
         rows.append(
             ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")
         )
-        rows.append(("confidence", fixed(plan.confidence, 2)))
+        rows.append(("confidence (0 to 1)", fixed(plan.confidence, 2)))
     if not plan.felt:
         rows.append(("seam", UNFELT))
     for record in plan.records:

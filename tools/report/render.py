@@ -100,7 +100,7 @@ def sigma_rows(covariance: Array) -> list[tuple[str, str]]:
     """Return the two rows of one sigma of a pose with covariance (6, 6) [rotation; translation], rad and m."""
     sigma = np.sqrt(np.diag(covariance))
     return [
-        ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
+        ("one sigma of the position (origin of the scanner), mm", fixed_row(1e3 * sigma[3:], 3)),
         ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
     ]
 
