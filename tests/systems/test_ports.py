@@ -402,6 +402,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "scan": Scan,
         "job": JobCommand,
         "calibration_status": CalibrationStatus,
+        "servo_report": ServoReport,
         "history": PoseHistory,
         "planned_seam": PlannedSeam,
     },
@@ -409,6 +410,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "scan": Scan,
         "job": JobCommand,
         "calibration_status": CalibrationStatus,
+        "servo_report": ServoReport,
         "history": PoseHistory,
         "planned_seam": PlannedSeam,
     },
@@ -472,6 +474,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
         "hold": 1,
+        "answered": 1,
         "arm_stopped": 1,
         "drift": DriftStatus,
         "job": JobCommand,
@@ -492,7 +495,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     PortPlayer: {},
     CameraDirector: {"job": JobCommand},
     LiveWriter: {"job": JobCommand, "margin": 2},
-    OperatorPanel: {"hold": 1, "end": 1, "pace": 1},
+    OperatorPanel: {"hold": 1, "end": 1, "pace": 1, "answered": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
 }
 

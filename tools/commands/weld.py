@@ -109,9 +109,16 @@ def restarting(restart: Restart) -> dict[str, Replacement]:
     return {"seam_planner": planner, "job_sequencer": sequencer}
 
 
-def keeper_of(scenario: Scenario, options: RunOptions, earlier: WeldProgress | None = None) -> ProgressKeeper:
-    """Keeps the progress of a run of this scenario; `earlier`: of the weld that it goes on with."""
-    files, folder = packed(scenario), str(options.out.absolute())
+def keeper_of(scenario: Scenario, options: RunOptions, earlier: WeldProgress | None = None) -> ProgressKeeper | None:
+    """Keeps the progress of a run of this scenario; `earlier`: of the weld that it goes on with.
+
+    None where no file can name the scenario's drivers: such a weld is not resumed.
+    """
+    folder = str(options.out.absolute())
+    try:
+        files = packed(scenario)
+    except RuntimeError:  # yaml_dump_typed: a driver that was made in Python
+        return None
     begun = earlier or WeldProgress(
         scenario=options.scenario, seed=options.seed, robot=options.robot, scenario_sha256="", folders=()
     )
@@ -199,13 +206,16 @@ def run_scenario(
     """
     keeper = keeper_of(scenario, options, earlier)
     try:
-        finished = run_job(scenario, options, progress, "", None if options.dry_run else keeper.look)
+        look = None if options.dry_run or keeper is None else keeper.look
+        finished = run_job(scenario, options, progress, "", look)
     except BaseException:
-        keeper.close()
+        if keeper is not None:
+            keeper.close()
         raise
-    keeper.close(finished.run)
+    if keeper is not None:
+        keeper.close(finished.run)
     progress("measure and write", finished.share(0.985))
-    result = measure(finished.run, options, finished.robot, keeper.progress)
+    result = measure(finished.run, options, finished.robot, None if keeper is None else keeper.progress)
     write_result(result, finished)
     return result
 

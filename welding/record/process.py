@@ -118,7 +118,9 @@ class PathError:
 
     def ends_m(self, length_m: float = END_M) -> tuple[float, float, float]:
         """Largest distance in space over the first and the last stretch, and between them, m; NaN without samples."""
-        first, last = (np.abs(self.s - self.s[k]) <= length_m for k in (0, -1))
+        first, last = self.s <= self.s[0] + length_m, self.s >= self.s[-1] - length_m
+        if self.s[-1] < self.s[0]:  # backwards
+            first, last = self.s >= self.s[0] - length_m, self.s <= self.s[-1] + length_m
         most = (np.max(self.distance_m, where=part, initial=-np.inf) for part in (first, last, ~(first | last)))
         first_m, last_m, between_m = (float(v) if v >= 0.0 else math.nan for v in most)
         return first_m, last_m, between_m

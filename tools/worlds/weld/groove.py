@@ -91,9 +91,9 @@ class Groove:
     wedge: Wedge = DRAWN
     tacks: tuple[tuple[float, float, float], ...] = ()
 
-    def floor(self, s: float, y: float) -> tuple[float, float]:
+    def floor(self, s: float, y: float, wedge: Wedge) -> tuple[float, float]:
         """Lowest height m of the tip's centre over its seat at s and y m, and its slope across; a tack's ends slope."""
-        low, slope = self.wedge.floor(y)
+        low, slope = wedge.floor(y)
         for a, b, top in self.tacks:
             height = min(top, s - a, b - s)
             if height > low:
@@ -123,7 +123,7 @@ class TipPlace:
         Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge.
         Across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
         """
-        groove, line = self._groove, self._groove.line
+        groove, line, wedge = self._groove, self._groove.line, self._wedge
         r0, r1, r2 = rest.tolist()
         for _ in range(max(1, round(dt / STEP_S))):
             p0, p1, p2, t0, t1, t2, n0, n1, n2, u0, u1, u2, curvature = line.frame_numbers(self.s)
@@ -131,13 +131,13 @@ class TipPlace:
             gt = g0 * t0 + g1 * t1 + g2 * t2
             gn = g0 * n0 + g1 * n1 + g2 * n2 - self.y
             gb = g0 * u0 + g1 * u1 + g2 * u2 - self.z
-            low, slope = groove.floor(self.s, self.y)
+            low, slope = groove.floor(self.s, self.y, wedge)
             lifted = gb > 0.0 or self.z > low + 1e-9
             if not groove.present(self.s) or (lifted and self.z + _SHARE * gb > low):
                 self.touching = False
                 self.s, self.y, self.z = self.s + _SHARE * gt, self.y + _SHARE * gn, self.z + _SHARE * gb
                 if groove.present(self.s):
-                    self.z = max(self.z, groove.floor(self.s, self.y)[0])
+                    self.z = max(self.z, groove.floor(self.s, self.y, wedge)[0])
                 continue
             self.touching = True
             self._slide(gt, gn, gb, low, slope, curvature)
@@ -160,7 +160,7 @@ class TipPlace:
         self.s += math.copysign(min(way, _MAX_SLIDE_M), gt)
         seated = abs(self.y) < 1e-7
         if seated and abs(push) <= press * wedge.steep:
-            self.y, self.z = 0.0, self._groove.floor(self.s, 0.0)[0]
+            self.y, self.z = 0.0, self._groove.floor(self.s, 0.0, wedge)[0]
             return
         drive = push - press * (math.copysign(wedge.steep, push) if seated else slope)
         drag = friction * press * math.sqrt(1.0 + slope * slope)
@@ -169,4 +169,4 @@ class TipPlace:
             move = _SHARE * math.copysign(abs(drive) - drag, drive) / stiff
             y = self.y + max(-_MAX_SLIDE_M, min(_MAX_SLIDE_M, move))
             self.y = 0.0 if y * self.y < 0.0 else y
-        self.z = self._groove.floor(self.s, self.y)[0]
+        self.z = self._groove.floor(self.s, self.y, wedge)[0]

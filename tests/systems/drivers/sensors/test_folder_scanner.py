@@ -255,7 +255,7 @@ def test_points_in_another_unit_are_refused_and_read_with_the_right_one(start: S
     scanner.request(1)
     time.sleep(0.05)
     drop(tmp_path, "a.npz", 1e3 * cloud(1))
-    assert wait_until(lambda: "set scanner.unit" in (scanner.fault(time.monotonic()) or ""))
+    assert wait_until(lambda: "Set scanner.unit" in (scanner.fault(time.monotonic()) or ""))
     in_mm = start(unit="mm")
     in_mm.request(1)
     time.sleep(0.05)
