@@ -85,6 +85,7 @@ def weld_until(
     operator = Operator()
     cell = build_cell(scenario, seed, operator=operator)
     keeper = keeper_of(scenario, RunOptions(scenario="short", out=folder, seed=seed))
+    assert keeper is not None
     stopped = False
 
     def look(run: Any) -> None:
@@ -114,6 +115,7 @@ def go_on(scenario: Scenario, seed: int, progress: Progress, folder: Path, torch
         if hasattr(system, "_seed"):
             system._seed += 1000
     keeper = keeper_of(scenario, RunOptions(scenario="short", out=folder, seed=seed), progress)
+    assert keeper is not None
     crater, before = torch.p_B, Torch()
 
     def look(run: Any) -> None:

@@ -248,7 +248,8 @@ def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
 ) -> None:
     simulated = build_cell(load_scenario("straight_groove", WELD_ONLY), 0)
     try:
-        torch = {"process_on", "arc_established", "arm.process_on", "arm.arc_established"}  # wired to a real one only
+        names = ("process_on", "arc_established", "set_values")  # wired to a real one only
+        torch = {*names, *(f"arm.{name}" for name in names)}
         wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
         assert rendered == wired
         assert len(wired[0]) > 10

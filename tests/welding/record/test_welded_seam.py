@@ -163,9 +163,9 @@ def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -
     png = cv2.imencode(".png", picture)[1].tobytes()
     plot = arc_over_time(record, record.torch_on, order.limits)
     assert plot is not None
-    PartRecord(order=order, log=record, seams=(only(record),), pictures={"seam_1_start": png}, plots={(1, 1): plot}).write(
-        tmp_path
-    )
+    PartRecord(
+        order=order, log=record, seams=(only(record),), pictures={"seam_1_start": png}, plots={(1, 1): plot}
+    ).write(tmp_path)
     page = (tmp_path / "record.html").read_text()
     assert "Record of the weld of part 0711" in page
     assert "1 seam welded, 1 of the limits exceeded" in page
