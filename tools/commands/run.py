@@ -136,7 +136,7 @@ def run_job(
         check_scenario(scenario)
     meshcat = None
     with (
-        _one_thread(),
+        one_thread(),
         chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
         operator_at() as operator,
     ):
@@ -184,7 +184,7 @@ def run_job(
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Let NumPy and OpenCV use one thread for the duration of the block.
 
     The products of a tick and the finger camera's pictures are small: a second thread waits busily for the next one and
