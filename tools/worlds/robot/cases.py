@@ -208,12 +208,9 @@ RUNNING: tuple[FaultCase, ...] = (
         rest_s=1.0,
         short=False,
     ),
-    # ur_rtde ends its own process at a reset in some runs: the arm stops all the same, and the worker's end is reported
-    _stops("RTDE connection reset", _fault("reset_tcp"), LINK, over_ur_rtde=frozenset({Fault.WORKER_DIED})),
+    _stops("RTDE connection reset", _fault("reset_tcp"), LINK),
     _stops("RTDE connection closed", _fault("close_tcp"), LINK, short=False),
-    _stops(
-        "every connection reset", _fault("reset_tcp", kind="all"), LINK, over_ur_rtde=frozenset({Fault.WORKER_DIED})
-    ),
+    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
     FaultCase(name="numbers 15 ms late", throw=_fault("mute_input", seconds=0.015), must=GO, may_rest=True),
