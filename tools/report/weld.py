@@ -358,7 +358,7 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
         mean=mean,
         least=min(w.least for w in welds),
         most=max(w.most for w in welds),
-        cv=float(np.sqrt(spread @ length / length.sum())) / mean,
+        cv=float(np.sqrt(spread @ length / length.sum())) / mean if mean else 0.0,
         outside_m=sum(w.outside_m for w in welds),
         welded_m=float(length.sum()),
         seconds=sum(w.seconds for w in welds),

@@ -131,7 +131,7 @@ class SpeedStatistics:
     """Statistics of the torch speed over arc length.
 
     Attributes:
-        mean, least, most: m/s; cv: standard deviation over mean, by arc length.
+        mean, least, most: m/s; cv: standard deviation over mean, by arc length; 0 where the torch stood still.
         outside_m: length of weld at a speed outside +-25 % of the wanted one.
         welded_m: length welded; seconds: time it took.
     """
@@ -203,7 +203,7 @@ def speed_statistics(
         mean=mean,
         least=float(speed.min()),
         most=float(speed.max()),
-        cv=spread / mean,
+        cv=spread / mean if mean else 0.0,
         outside_m=outside,
         welded_m=total,
         seconds=float(t_on[-1] - t_on[0]),

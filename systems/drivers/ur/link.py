@@ -111,7 +111,7 @@ class UrLink:
             self._process.stdin.write(pickle.dumps(config))
             self._process.stdin.close()
         self._number = 0
-        self._died: tuple[Fault, float] | None = None
+        self._died: tuple[Fault, float, float] | None = None
         self._last: Published | None = None
         self._stopper: threading.Thread | None = None
         self._finalizer = weakref.finalize(self, _kill, self._process)
@@ -192,19 +192,23 @@ class UrLink:
         if found is None:
             raise RuntimeError("the link has not started")
         now = time.monotonic()
-        fault, fault_time = Fault(found.fault), found.fault_time
+        fault, fault_time, detail = Fault(found.fault), found.fault_time, found.detail
         if fault is Fault.NONE and self._died is None and found.phase != WorkerPhase.ENDED:
             limits = self._config.limits
             quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
-            if quiet or self._process.poll() is not None:
-                self._died = (Fault.WORKER_DIED, now)
+            ended = self._process.poll() is not None
+            if quiet or ended:
+                # ur_rtde connects again inside a call, for as long as it takes: the worker lives, and its data are old
+                calling = None if ended else self._memory.calling.read()
+                blocked = calling is not None and calling.inside
+                self._died = (Fault.LINK_STALE if blocked else Fault.WORKER_DIED, now, 1e3 * (now - found.host_time))
                 _kill(self._process)
         if fault is Fault.NONE and self._died is not None:
-            fault, fault_time = self._died
+            fault, fault_time, detail = self._died
         paused = found.runtime_state in (PAUSING, PAUSED)
         if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
             self._see_to_the_stop()
-        judged = vars(found) | {"fault": fault, "fault_time": fault_time}
+        judged = vars(found) | {"fault": fault, "fault_time": fault_time, "detail": detail}
         return LinkState(**judged, age_s=now - found.host_time)
 
     def close(self) -> None:

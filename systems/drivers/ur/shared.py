@@ -217,6 +217,13 @@ class Published:
     arc: int = 0  # 1 established, 0 not, -1: not wired
 
 
+@dataclass(frozen=True, eq=False)
+class Calling:
+    """Whether the worker is inside a call of the transport, which may not return where the connection is lost."""
+
+    inside: bool = False
+
+
 class Memory:
     """The shared memory: one anonymous file, mapped by both processes."""
 
@@ -224,9 +231,10 @@ class Memory:
         self._map = mmap.mmap(descriptor, self.size())
         self.command = Record(self._map, 0, Given)
         self.state = Record(self._map, Record.size(Given), Published)
-        self.ring = JointRing(self._map, Record.size(Given) + Record.size(Published))
+        self.calling = Record(self._map, Record.size(Given) + Record.size(Published), Calling)
+        self.ring = JointRing(self._map, self.size() - JointRing.size())
 
     @staticmethod
     def size() -> int:
         """Bytes to reserve."""
-        return Record.size(Given) + Record.size(Published) + JointRing.size()
+        return sum(map(Record.size, (Given, Published, Calling))) + JointRing.size()

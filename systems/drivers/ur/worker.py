@@ -19,7 +19,7 @@ import numpy as np
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.robot import ControllerStream, Refused, WorkerConfig
 from weldcal.systems.drivers.ur.set_points import Gas, SetPoints, apart
-from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
+from weldcal.systems.drivers.ur.shared import Calling, Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
     STOPPING,
@@ -126,7 +126,9 @@ class Worker:
                 self._publish(now, robot, sample, decision)
                 return LEFT
             if self._phase is WorkerPhase.OBEYING:
+                self._memory.calling.write(Calling(inside=True))
                 self._drive(now, robot, sample, command, decision)
+                self._memory.calling.write(Calling(inside=False))
             self._publish(now, robot, sample, decision)
             if (command.stop or command.orphaned) and self._phase is not WorkerPhase.OBEYING:
                 self._valve(robot, False)

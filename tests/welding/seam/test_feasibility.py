@@ -112,5 +112,7 @@ def test_speed_counts_by_length_where_the_arc_burned() -> None:
     assert result.mean == pytest.approx(13.33e-3, rel=0.01)
     assert result.cv == pytest.approx(3.77 / 13.33, rel=0.02)
     assert result.outside_m == pytest.approx(0.16, abs=0.002)
+    stands = speed_statistics(t, 0.0 * p, on, 0.008)  # a job that is held before the torch moves on
+    assert (stands.mean, stands.cv) == (0.0, 0.0)
     with pytest.raises(ProcessLogError, match="never"):
         speed_statistics(t, p, np.zeros(len(t), dtype=bool), 0.008)
