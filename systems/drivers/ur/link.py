@@ -198,10 +198,7 @@ class UrLink:
             quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
             ended = self._process.poll() is not None
             if quiet or ended:
-                # ur_rtde connects again inside a call, for as long as it takes: the worker lives, and its data are old
-                calling = None if ended else self._memory.calling.read()
-                blocked = calling is not None and calling.inside
-                self._died = (Fault.LINK_STALE if blocked else Fault.WORKER_DIED, now, 1e3 * (now - found.host_time))
+                self._died = (self._cause(ended), now, 1e3 * (now - found.host_time))
                 _kill(self._process)
         if fault is Fault.NONE and self._died is not None:
             fault, fault_time, detail = self._died
@@ -237,6 +234,14 @@ class UrLink:
         # without a dashboard (PolyScope X, or no network) the guard's watchdog has stopped the arm
         with contextlib.suppress(RobotRefused):
             stop_program(self._config.host)
+
+    def _cause(self, ended: bool) -> Fault:
+        """Return the fault of a worker that gives no state: after a lost connection ur_rtde may crash, or connect again
+        inside a call for as long as it takes."""
+        if ended:
+            return Fault.LINK_CLOSED if "disconnected" in self._said() else Fault.WORKER_DIED
+        calling = self._memory.calling.read()
+        return Fault.LINK_STALE if calling is not None and calling.inside else Fault.WORKER_DIED
 
     def _said(self) -> str:
         self._errors.seek(0)
