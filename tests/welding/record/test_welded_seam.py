@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -96,6 +97,15 @@ def test_the_time_before_the_arc_is_no_time_of_welding() -> None:
     standing = only(log([0.0] * 100 + [0.010] * 251))
     # 0.8 s of standing with the arc on: 1.8 s for the first 10 mm
     assert standing.figures["speed_mm_s"].least == pytest.approx(10.0 / 1.8, rel=0.01)
+
+
+def test_ordered_standing_is_no_travel_and_longer_standing_is() -> None:
+    stands = log([0.0] * 100 + [0.010] * 251 + [0.0] * 50)
+    found = only(replace(stands, settings={"start_s": 0.8, "crater_s": 0.4}))
+    assert (found.arc_s, found.welded_mm) == pytest.approx((3.2, 20.0), rel=0.01)
+    assert found.figures["speed_mm_s"].least == pytest.approx(10.0, rel=0.01)
+    shorter = only(replace(stands, settings={"start_s": 0.3, "crater_s": 0.4}))
+    assert shorter.figures["speed_mm_s"].least == pytest.approx(10.0 / 1.5, rel=0.01)
 
 
 def test_a_hold_is_no_time_of_welding() -> None:
