@@ -161,6 +161,31 @@ def test_an_order_that_cannot_be_is_refused(order: str, said: str) -> None:
         load_scenario("s_groove", f"welding: {{order: {order}}}")
 
 
+@pytest.mark.parametrize(
+    ("limit", "process", "said"),
+    [
+        ("heat_input_kJ_mm: [0.1, 2]", "", "needs the arc's current and voltage"),
+        ("current_A: [100, 200]", "", "needs the arc's current and voltage"),
+        ("current_A: [100, 200]", "current_A: 150, voltage_V: 20, efficiency: 0.8", ""),
+        ("heat_input_kJ_mm: [0.1, 2]", "name: MAG, current_A: 150, voltage_V: 20", ""),
+    ],
+)
+def test_a_limit_of_what_nobody_knows_is_refused_before_the_weld(limit: str, process: str, said: str) -> None:
+    keys = f"welding: {{order: {{limits: {{{limit}}}}}, process: {{{process}}}}}"
+    if said:
+        with pytest.raises(InputError, match=said):
+            load_scenario("s_groove", keys)
+    else:
+        assert load_scenario("s_groove", keys).welding.order.limits != OrderLimits()
+
+
+def test_heat_by_a_power_source_needs_the_process() -> None:
+    order = "{power_source: !SimulatedPowerSource {}, welding: {order: {limits: {heat_input_kJ_mm: [0.1, 2]}}PROCESS}}"
+    with pytest.raises(InputError, match=r"write welding\.process\.name"):
+        load_scenario("s_groove", order.replace("PROCESS", ""))
+    assert load_scenario("s_groove", order.replace("PROCESS", ", process: {name: MAG}")).welding.process.name == "MAG"
+
+
 def test_a_line_break_in_an_order_is_refused() -> None:
     with pytest.raises(WeldOrderError, match="one line"):
         WeldOrder(note="a\nb").check()
