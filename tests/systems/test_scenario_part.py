@@ -19,7 +19,7 @@ from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, SeamConfig, WorkpieceConfig
 from weldcal.systems.station import make_station
 from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, write_step
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, prism, write_step
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +158,25 @@ def test_the_end_of_a_sheet_is_too_short_a_leg_and_the_advice_is_taken(tmp_path:
     assert seam_count(part_of(replace(spec, seams=[SeamConfig(**seam) for seam in advice]))) == 2
     unfelt = [SeamConfig(edges=list(joint.edges), feel=False)]
     assert seam_count(part_of(replace(spec, seams=unfelt))) == 4
+
+
+def test_the_search_reaches_beyond_the_root_of_a_wide_groove(tmp_path: Path) -> None:
+    """From the face beside it: 9.6 mm and the ball to the root, and the wanted deflection beyond."""
+    half = [(0.0, 0.0, 0.0), (0.0, 100.0, 0.0), (0.0, 100.0, 21.0), (0.0, 9.6, 21.0), (0.0, 0.0, 2.0)]
+    sides = [prism([(x, side * y, z) for x, y, z in half], (120.0, 0.0, 0.0)) for side in (1.0, -1.0)]
+    write_step(assembly(*sides), tmp_path / "v.step")
+    (seam,) = [j for j in read_shape(tmp_path / "v.step").joints if j.type == "V"]
+    scenario = load_scenario("straight_groove")
+    scenario.workpiece = WorkpieceConfig(
+        file=str(tmp_path / "v.step"), seams=[SeamConfig(edges=list(seam.edges))], joint="v_groove"
+    )
+    station = make_station(scenario, seed=0)
+    try:
+        config = servo_config(scenario, station)
+    finally:
+        station.close()
+    assert config.touch.offset_m < -0.0096
+    assert config.touch.range_m > -config.touch.offset_m + config.deflection.delta_d_m + 0.003
 
 
 def test_a_part_lies_off_by_its_middle_and_not_by_the_origin_of_its_file(cell: Path, tmp_path: Path) -> None:

@@ -147,7 +147,12 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
     )
     return ServoConfig(
         tool=geometry,
-        touch=TouchOnConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
+        touch=TouchOnConfig(
+            zero_frames=ZERO_FRAMES,
+            offset_m=entry.aside_m,
+            # from the face beside a wide groove as far beyond its root as beside a usual one
+            range_m=max(TouchOnConfig.range_m, TouchOnConfig.range_m + TouchOnConfig.offset_m - entry.aside_m),
+        ),
         gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
