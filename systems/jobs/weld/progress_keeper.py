@@ -96,11 +96,13 @@ class ProgressKeeper:
         self, report: ServoReport, state: WeldingState, planned: PlannedSeam, run: Run[WeldJob], lit: bool
     ) -> None:
         assert report.X_BT is not None
-        s = planned.begins_m + state.s_torch
+        assert state.plan_fit is not None
+        p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
+        # while the tool stands for its arc, s_torch is the place where it began to come to rest
+        s = planned.begins_m + state.plan_fit.curve.nearest(p_BCrater, state.s_torch)
         if math.isnan(self._from_m):
             self._from_m = s
         if lit and s > self._to_m:
-            p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
             self._to_m = s
             self._progress = replace(self._progress, p_BCrater=p_BCrater)
         late = run.seconds - self._time > EVERY_S and s > self._at
