@@ -159,6 +159,9 @@ def new(
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)
         note = {"note": reason} if reason else {}
+        spec = load_scenario(str(written)).workpiece
+        if part is not None and spec is not None:
+            note = {"seams": "; ".join("edges " + ", ".join(map(str, seam.edges)) for seam in spec.seams)} | note
     values = {"written": str(written), **note, "next": following}
     return Outcome({"state": "done", **values}, values=values)
 
@@ -249,6 +252,8 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
             return unfinished, reason
         if note:
             note = f"{note} As a whole: {refusals[seams[0].edges[0]]}"
+        # The part is planned on the branch of home, and will not lie exactly as drawn.
+        scenario.welding.posture = "any"
     _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
     unfinished.unlink(missing_ok=True)
     return path, note
