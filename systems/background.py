@@ -3,6 +3,7 @@
 import importlib
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -165,6 +166,15 @@ def _begin_process() -> None:
     importlib.import_module("scipy.linalg")  # its linear algebra is not NumPy's, and only what is loaded can be limited
     importlib.import_module("threadpoolctl").threadpool_limits(1, user_api="blas")
     before_other_programs()
+    threading.Thread(target=_end_with_program, daemon=True).start()
+
+
+def _end_with_program() -> None:
+    """End this process when its program is killed: it holds the queue's both ends, and would wait for ever."""
+    program = multiprocessing.parent_process()
+    assert program is not None
+    program.join()
+    os._exit(1)
 
 
 def before_other_programs(thread: int = 0) -> None:

@@ -41,6 +41,7 @@ killed, and the robot with it. Protective: the emulated controller stops. Killed
 ACROSS_MM, ALONG_MM = 0.3, 1.0
 OVERLAP_M, PAUSE_OVERLAP_M = 8e-3, 5e-3
 NEAR_M = 8e-3
+PACE = 0.3  # of the emulated controller: on a loaded computer the camera's pictures were too late at 1
 FIRST_M, LAST_M = 0.5e-3, 23.5e-3  # of the 24 mm seam
 
 
@@ -105,6 +106,8 @@ def weld_until(
 
     run = run_cell(cell, look=look)
     keeper.close(run)
+    if not stopped:
+        print(f"not broken off: {run.reason}")
 
 
 def go_on(scenario: Scenario, seed: int, progress: Progress, folder: Path, torch: Torch) -> Join:
@@ -134,7 +137,6 @@ def go_on(scenario: Scenario, seed: int, progress: Progress, folder: Path, torch
     keeper.close(run)
     found = weld_outcome(cell, run.root)
     if found is None or found.error is None or found.true_seam is None:
-        print(run.phases, cell.job.servo_report(run.root))
         return Join(crater_mm=np.nan, across_mm=np.inf, along_mm=np.inf, unasked=arcs, reason=run.reason)
     at = float(found.true_seam.project(crater))
     near = np.abs(found.error.s - at) < NEAR_M
@@ -219,19 +221,19 @@ def one(kind: str, at_m: float, seed: int, place: Path) -> Join | None:
         def scenario() -> Scenario:
             found = short_weld()
             if emulator is not None:
-                found.robot = UrRtde(host=emulator.host, lockstep=True, process_output=3)
+                found.robot = UrRtde(host=emulator.host, lockstep=True, process_output=3, pace=PACE)
             return found
 
         if kind in WIRED:
             q = np.deg2rad(short_weld().home_deg).tolist()
-            emulator = stack.enter_context(emulator_process(q=q, lockstep=LOCKSTEP_S))
+            emulator = stack.enter_context(emulator_process(q=q, lockstep=LOCKSTEP_S, pace=PACE))
         status, _ = apart(lambda: weld_until(scenario(), seed, at_m, kind, place / "1", torch, emulator))
         if kind in ("power", "killed") and status != signal.SIGKILL:
             return None
         progress = load_progress(place / "1")
         if kind in WIRED:  # the operator frees the arm, and moves it home by the pendant
             stack.close()
-            emulator = stack.enter_context(emulator_process(q=q, lockstep=LOCKSTEP_S))
+            emulator = stack.enter_context(emulator_process(q=q, lockstep=LOCKSTEP_S, pace=PACE))
         found: Join | None = apart(lambda: go_on(scenario(), seed, progress, place / "2", torch))[1]
         return found
 

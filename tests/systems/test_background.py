@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses as dc
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -90,6 +92,21 @@ def test_a_process_that_ends_is_named() -> None:
             _ = asked.value
     finally:
         background.close()
+
+
+KILLED = """
+import os, signal
+from weldcal.systems.background import OwnProcess
+print(OwnProcess().ask(os.getpid).value, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_process_ends_with_a_killed_program() -> None:
+    # It has the program's output too: while it lives, that has no end.
+    done = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True, timeout=60.0)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert int(done.stdout)
 
 
 @dataclass

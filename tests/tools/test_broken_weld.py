@@ -61,6 +61,15 @@ def test_what_cannot_go_on_is_refused(broken: Path) -> None:
     assert "holds no broken weld" in resumed(broken / RESTART)
 
 
+def test_later_passes_are_not_welded_along_a_part_of_the_root(tmp_path: Path) -> None:
+    scenario = load_scenario("straight_groove", "welding: {passes: [{vertical_mm: 3.0}]}")
+    for name, data in packed(scenario).items():
+        write_apart(tmp_path / RESTART / name, data)
+    for done in (False, True):  # the root's end is not the weld's
+        state(tmp_path, done=done).write(tmp_path)
+        assert "of several passes cannot go on" in resumed(tmp_path)
+
+
 def test_a_weld_whose_process_was_killed_goes_on() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.restarted", "1", "4", "power"], capture_output=True, text=True, cwd=ROOT

@@ -71,8 +71,6 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
         InputError: there is nothing to go on with, its files were changed, or nobody could answer the question.
     """
     progress = load_progress(folder)
-    if progress.done:
-        raise ProgressError(f"The weld in '{folder}' is complete: nothing is left to weld.")
     if progress.continued_in:
         raise ProgressError(f"The weld in '{folder}' has gone on in '{progress.continued_in}': resume that one.")
     files = {path.name: path.read_bytes() for path in (folder / RESTART).glob("*") if path.is_file()}
@@ -81,6 +79,11 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
             f"The scenario in '{folder / RESTART}' is not that of the broken weld: restore its files, or weld the rest"
             " by hand."
         )
+    scenario = load_scenario(str(folder / RESTART / SCENARIO))
+    if scenario.welding.passes:  # the path that a later pass follows was felt by several runs
+        raise ProgressError("A broken weld of several passes cannot go on: weld the rest by hand.")
+    if progress.done:
+        raise ProgressError(f"The weld in '{folder}' is complete: nothing is left to weld.")
     if not (live.get("browser") or sys.stdin.isatty()):
         raise InputError(
             "The arc of a restart starts only after an operator's yes, and nobody could give it: run the command in a"
@@ -92,7 +95,7 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     options: dict[str, Any] = {"replace": restarting(progress.restart(1e-3 * overlap_mm))}
     if live.get("robot") is None:
         options["robot"] = progress.robot
-    return BrokenWeld(progress, load_scenario(str(folder / RESTART / SCENARIO)), options)
+    return BrokenWeld(progress, scenario, options)
 
 
 def restarting(restart: Restart) -> dict[str, Replacement]:

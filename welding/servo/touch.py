@@ -30,10 +30,10 @@ def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
     touch, tool = config.touch, config.tool
     frame = plan.frame(touch.arc_m)
     behind = plan.frame(touch.arc_m - tool.torch_offset_m)
-    x = frame.position - behind.position
-    x = unit(x - dot(x, frame.up) * frame.up, frame.tangent)
-    y, lean = np.cross(frame.up, x), config.torch.work_angle_rad
-    y = math.cos(lean) * y + math.sin(lean) * frame.up
+    # Along the chord, so that the torch is on the seam too where the face turns along it, as on a pipe.
+    x = unit(frame.position - behind.position, frame.tangent)
+    y, lean = unit(np.cross(frame.up, x), frame.normal), config.torch.work_angle_rad
+    y = math.cos(lean) * y + math.sin(lean) * np.cross(x, y)
     R = np.column_stack([x, y, np.cross(x, y)])
     height = tool.tip_seat_height_m + tool.tip_drop_m + touch.height_m
     p_BT = frame.position + height * frame.up + touch.offset_m * frame.normal

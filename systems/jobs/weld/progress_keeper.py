@@ -22,7 +22,8 @@ from weldcal.welding.servo.state import Phase, WeldingState
 
 RESTART: Final = "restart"
 """Folder of a result with the files of its scenario, from which the weld can go on."""
-EVERY_M, EVERY_S = 0.5e-3, 0.5  # a choice: with the time of writing a kill loses less than 1 mm at 16 mm/s
+EVERY_M, EVERY_S = 0.2e-3, 0.5  # a choice: with the time of writing a kill loses less than 1 mm at 16 mm/s
+_FELT_EVERY_M = 0.5e-3  # a choice: points are needed so much more rarely, and cost more time
 _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need again
 _SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
 _LONGEST_LAG_M = 2.0e-3  # a choice: the farthest that friction has held a tip back
@@ -95,11 +96,13 @@ class ProgressKeeper:
         self, report: ServoReport, state: WeldingState, planned: PlannedSeam, run: Run[WeldJob], lit: bool
     ) -> None:
         assert report.X_BT is not None
-        s = planned.begins_m + state.s_torch
+        assert state.plan_fit is not None
+        p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
+        # while the tool stands for its arc, s_torch is the place where it began to come to rest
+        s = planned.begins_m + state.plan_fit.curve.nearest(p_BCrater, state.s_torch)
         if math.isnan(self._from_m):
             self._from_m = s
         if lit and s > self._to_m:
-            p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
             self._to_m = s
             self._progress = replace(self._progress, p_BCrater=p_BCrater)
         late = run.seconds - self._time > EVERY_S and s > self._at
@@ -155,7 +158,7 @@ class ProgressKeeper:
             raise self._problem
 
     def _write(self) -> None:
-        marked = False
+        marked, felt, felt_at = False, None, -math.inf
         try:
             for name, data in self._files.items():
                 write_apart(self._folder / RESTART / name, data)
@@ -168,7 +171,9 @@ class ProgressKeeper:
                     return
                 progress, state = slot
                 if state is not None:
-                    progress = replace(progress, felt=felt_points(state))
+                    if abs(state.torch_arc - felt_at) > _FELT_EVERY_M:  # below 0 in a new seam
+                        felt, felt_at = felt_points(state), state.torch_arc
+                    progress = replace(progress, felt=felt)
                 progress.write(self._folder)
                 if state is not None and not marked:
                     self._mark_earlier()

@@ -194,7 +194,7 @@ def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: Wel
     if felt is None:
         assert state is not None
         felt = felt_line(state, TIP_AHEAD * planning.tool.chord_m)
-    record = SeamRecord(root.records[-1].seam if root.records else 0, weld_pass=number)
+    record = SeamRecord(root.records[-1].seam, weld_pass=number)
     plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
     try:
         seam, way = planning.pass_way(felt, number, root.X_BP)
@@ -468,11 +468,13 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
+    records = (*planning.earlier, SeamRecord(planning.number))
     try:
         whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
         return dc.replace(
             _planned(planning, sequence, seam, planning.X_BP_guess),
+            records=records,
             touch_arc_m=arc,
             **again,
             rms_m=0.0,
@@ -481,4 +483,4 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
             summary="the pose of the part is from the fixture's drawing; the scan was not used",
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=sequence, reason=str(error))
+        return PlannedSeam(sequence=sequence, reason=str(error), records=records)

@@ -180,7 +180,8 @@ def test_the_plan_states_what_errors_of_the_arm_do(plan: PlannedSeam, config: Se
         clearance_m=CLEARANCE_M,
         seam_length_m=0.1,
     )
-    drawn = plan_drawn_seam(planning, 1)
+    drawn = plan_drawn_seam(replace(planning, number=1), 1)
+    assert [record.seam for record in drawn.records] == [1], "a weld that goes on begins with a later seam"
     assert 2e-5 < plan.arm_sigma_m < 2e-4
     assert drawn.arm_sigma_m == pytest.approx(plan.arm_sigma_m, rel=0.05)
     assert plan.arm_turn_rad < np.radians(0.5)

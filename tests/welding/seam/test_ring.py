@@ -15,9 +15,10 @@ from weldcal.welding.numerics import pose
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, assess_seam
-from weldcal.welding.servo.settings import DeflectionControl, MotionLimits, ServoConfig, ToolGeometry
+from weldcal.welding.servo.settings import DeflectionControl, MotionLimits, ServoConfig, ToolGeometry, TouchOnConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel, least_pipe_m
+from weldcal.welding.servo.touch import touch_start_pose
 from weldcal.welding.servo.track import TorchTarget, guarded_motion
 
 D, V = 0.025, 0.008
@@ -131,3 +132,18 @@ def test_the_pitch_of_a_near_torch_is_ramped(ramp: float, pitch: float) -> None:
     motion = guarded_motion(WeldingState(), X_BT, tip, target, (0.0, 0.0), config, 0.008)
     # nose down: the torch rises about the tip
     assert motion.V_BT[:3] @ tip.normal == pytest.approx(pitch, rel=0.02)
+
+
+def test_the_torch_is_on_the_ring_when_the_tip_comes_down_on_it() -> None:
+    """In the middle of a ring, as where a broken weld goes on: a torch 11 mm above it would still be too high there."""
+    chord, radius, at = 0.060, 0.080, 0.2
+    config = ServoConfig(tool=ToolGeometry(torch_offset_m=chord), touch=TouchOnConfig(arc_m=at))
+    X_BT = touch_start_pose(ring(radius), config)
+    R, p_BT = X_BT.rotation().matrix(), X_BT.translation()
+    a = at / radius
+    p_tip = radius * np.array([math.cos(a), math.sin(a), 0.0])
+    p_torch = p_tip - chord * R[:, 0]
+    assert abs(p_torch[2]) < 1e-4
+    assert np.linalg.norm(p_torch[:2]) == pytest.approx(radius, abs=1e-3)
+    assert np.linalg.norm(R.T @ R - np.eye(3)) < 1e-9
+    assert (p_BT - p_tip) @ [math.cos(a), math.sin(a), 1.0] > 0.0, "above the face"
