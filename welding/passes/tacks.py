@@ -4,7 +4,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 
 CLEAR_M = 1e-3  # a choice: between the ball and a tack's top, above the error of a height by eye
 BESIDE_M = 3e-3  # a choice: before and after a tack, above what a plan is off along its seam
@@ -41,15 +44,18 @@ class Hop(NamedTuple):
     end: float
     height: float
 
-    def place(self, s: float, low_before: float, low_after: float) -> tuple[float, float]:
-        """Height m of the tip's rest over its seat at an arc length, and its slope."""
-        if s < self.down:
-            low, way, sign = low_before, (s - self.begin) / (self.up - self.begin), 1.0
-        else:
-            low, way, sign = low_after, (self.end - s) / (self.end - self.down), -1.0
-        x = min(max(way, 0.0), 1.0)
-        rise, length = self.height - low, self.up - self.begin if sign > 0.0 else self.end - self.down
-        return low + rise * x * x * (3.0 - 2.0 * x), sign * rise * 6.0 * x * (1.0 - x) / length
+    def place(self, s: float, before: Array, after: Array) -> tuple[Array, Array]:
+        """Place (2,) m of the tip's rest to the left of its seat and above it at an arc length, and its slope.
+
+        Args:
+            before, after: (2,) m, where it was pressed, and where it comes down.
+        """
+        low, way, length = before, s - self.begin, self.up - self.begin
+        if s >= self.down:
+            low, way, length = after, self.end - s, self.down - self.end
+        x = min(max(way / abs(length), 0.0), 1.0)
+        rise = np.array((0.0, self.height)) - low
+        return low + rise * x * x * (3.0 - 2.0 * x), rise * 6.0 * x * (1.0 - x) / length
 
 
 def hops(tacks: tuple[Tack, ...], speed_m_s: float, pressed_m: float) -> tuple[Hop, ...]:
