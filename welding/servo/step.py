@@ -291,7 +291,7 @@ def _weld(
     curve = state.plan_fit.curve
     p_BT = np.asarray(sample.X_BT.translation())
     at = p_BT
-    if state.phase == Phase.TRACK and state.measurement is not None:
+    if state.measurement is not None and (state.phase == Phase.TRACK or state.settling):
         # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
         at = state.measurement.point + (p_BT - state.measurement.p_BT)
     s_tip = curve.nearest(at, state.s_tip)
