@@ -18,7 +18,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_clearance
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, free_move, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
@@ -72,6 +72,7 @@ def plan_root_anyhow(
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 TACK_BESIDE_M = 3e-3  # a choice: about a tack, above what a scan and a list are off along the seam
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
+_DRAWN = "the pose of the part is from the fixture's drawing; the scan was not used"
 UNFELT = "followed from the scan and the drawing; not felt"
 
 
@@ -106,6 +107,9 @@ class SeamPlanning(Welder):
     restart: Restart | None = None  # the weld goes on there
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
     passes: tuple[WeldPass, ...] = ()  # after the root
+    keeps_scan: bool = False  # for the next seam
+    q_from: Array | None = None  # (6,) rad, above the end of the seam before; None: home
+    order_words: str = ""  # of the seams
     configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
 
     def goes_on(self) -> bool:
@@ -237,6 +241,7 @@ def plan_seam(
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
     record, more = SeamRecord(planning.number), False
+    kept = (*views, ScanView(scan, X_BC)) if planning.keeps_scan else ()
     try:
         found = plan_root_anyhow(
             scans if views else points_B,
@@ -270,6 +275,8 @@ def plan_seam(
         summary = f"{found.summary}; with scanner and arm its sigma is {1e3 * sigma_m:.2f} mm"
         if not felt:
             sigma_m, summary = unfelt_sigma(planning, found, at, others)
+        if planning.order_words:
+            summary += f"; {planning.order_words}"
         return dc.replace(
             plan,
             felt=felt,
@@ -279,6 +286,7 @@ def plan_seam(
             part_sigma_m=found.sigma_m,
             **again,
             gap=planned_gap(planning, found.fit_up, whole, seam),
+            views=kept,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
@@ -286,7 +294,8 @@ def plan_seam(
             summary=summary,
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=scan.sequence, reason=str(error), records=(*planning.earlier, record))
+        records = (*planning.earlier, record)
+        return PlannedSeam(sequence=scan.sequence, number=planning.number, reason=str(error), records=records)
 
 
 def planned_gap(planning: SeamPlanning, fit_up: FitUp | None, whole: SeamCurve, piece: SeamCurve) -> GapAlong | None:
@@ -415,6 +424,8 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
     share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
         sequence=sequence,
+        number=planning.number,
+        direct=planning.q_from is not None and free_move(planning, planning.q_from, way.q_above, X_BP),
         seam=seam,
         X_BP=X_BP,
         q_start=way.q_start,
@@ -478,7 +489,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
             rms_m=0.0,
             confidence=1.0,
             points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),
-            summary="the pose of the part is from the fixture's drawing; the scan was not used",
+            summary="; ".join(filter(None, (_DRAWN, planning.order_words))),
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=sequence, reason=str(error))
+        return PlannedSeam(sequence=sequence, number=planning.number, reason=str(error))

@@ -15,6 +15,7 @@ from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_pos
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
@@ -29,6 +30,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.passes.tacks import Tack
+from weldcal.welding.passes.travel import SeamTravel, seam_travel
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
@@ -326,10 +328,22 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=(job.maximum_time_s * slower * pieces * (1 + len(interpass_s)) + sum(interpass_s)) * seams,
-        seams=seams,
+        order=tuple(range(seams)),
+        direct=scenario.welding.between_seams == "direct",
         interpass_s=interpass_s,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )
+
+
+def travel_of(scenario: Scenario, station: Station) -> SeamTravel:
+    """The order of the seams, by the places where they are drawn."""
+    spec, cad, tool, welding = scenario.workpiece, station.cad, station.tool, scenario.welding
+    if spec is None or cad is None or tool is None:
+        return SeamTravel((0,), 0.0, 0.0)
+    ends = np.array([numbered(cad, k).seam_P[[0, -1]] for k in range(seam_count(cad))])
+    ends = ends @ spec.pose_guess.pose().rotation().matrix().T + spec.pose_guess.pose().translation()
+    home = (forward_kinematics(station.arm, np.deg2rad(scenario.home_deg)) @ tool.X_FT).translation()
+    return seam_travel(ends[:, 0], ends[:, 1], np.asarray(home), welding.seam_order == "least_travel")
 
 
 def calibrator_config(scenario: Scenario) -> CalibratorConfig:
