@@ -255,6 +255,8 @@ welding:
   lean_deg: 4.0
   tolerance_mm: 0.4
   pass_obstacles: true
+  seam_order: least_travel
+  between_seams: direct
   fit_up: limits.csv
   posture: any
 job:
