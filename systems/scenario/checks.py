@@ -292,11 +292,14 @@ def check_tack_order(scenario: Scenario) -> None:
 
 
 def check_seam_order(scenario: Scenario) -> None:
-    """Check the order of the seams; raises InputError."""
+    """Check the order of the seams and of their pieces; raises InputError."""
     welding = scenario.welding
     for name, known in (("seam_order", ("given", "least_travel")), ("between_seams", ("home", "direct"))):
         if getattr(welding, name) not in known:
             raise InputError(f"welding.{name} must be {' or '.join(known)}, not '{getattr(welding, name)}'.")
+    middle_out = welding.stitch is not None and welding.stitch.stitch().middle_out
+    if middle_out and (welding.tacks or welding.passes or welding.pass_obstacles):
+        raise InputError("welding.stitch.order: middle_out goes without welding.tacks, passes and pass_obstacles.")
     if welding.seam_order == "least_travel" and welding.between_seams == "home":
         raise InputError(
             "welding.seam_order: least_travel saves nothing where the arm goes home after each seam: write"

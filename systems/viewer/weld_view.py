@@ -52,7 +52,7 @@ class WeldView:
 
     def __init__(self, meshcat: Meshcat, root: str, tool: WeldingTool, cad: TriMesh | None) -> None:
         self._meshcat, self._root, self._tool, self._cad = meshcat, root, tool, cad
-        self._seam, self._pieces, self._next = (0, 0), 0, -np.inf
+        self._seam, self._pieces, self._next = (0, 0, 0), 0, -np.inf
         self._torch: list[Array] = []
         self._felt: list[Array] = []
         self._arrow, self._aside = False, np.zeros(3)

@@ -30,6 +30,7 @@ from weldcal.systems.jobs.weld.settings import (
     feature_on_flange,
     feature_standard,
     job_plan,
+    pieces_of,
     plan_poses,
     servo_config,
     travel_of,
@@ -344,6 +345,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
         schedule=welding.schedule,
         keeps_scan=welding.between_seams == "direct",
+        stitches=pieces_of(welding),
         order_words=travel_of(scenario, station).words,
     )
 

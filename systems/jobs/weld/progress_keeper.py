@@ -52,7 +52,7 @@ class ProgressKeeper:
         """
         self._folder, self._files, self._progress = folder, files, begun
         self._from_m, self._to_m, self._at, self._time = math.nan, -math.inf, -math.inf, -math.inf
-        self._plan, self._ended, self._lit = (0, 0), (0, 0), False
+        self._plan, self._ended, self._lit = (0, 0, 0), (0, 0, 0), False
         self._slot: tuple[Progress, WeldingState | None] | None = None
         self._changed, self._closing = threading.Condition(), False
         self._thread: threading.Thread | None = None

@@ -66,7 +66,7 @@ class SeamPlanner(BackgroundSystem):
             report: ServoReport = self._report.Eval(context)
             return self.background.ask(plan_pass, planning, newest, job.weld_pass, report.state)
         follows = job.phase == "plan_seam"
-        if follows and (job.seam == newest.number or newest.reason is not None):
+        if follows and ((job.seam, job.piece) == newest.key[1:] or newest.reason is not None):
             return None
         old = scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece"
         if old and not follows:

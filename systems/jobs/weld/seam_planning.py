@@ -24,11 +24,12 @@ from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
+from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.restart import Restart
+from weldcal.welding.seam.restart import SPARE_M, Restart
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
@@ -108,6 +109,7 @@ class SeamPlanning(Welder):
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
     passes: tuple[WeldPass, ...] = ()  # after the root
     keeps_scan: bool = False  # for the next seam
+    stitches: StitchConfig = dc.field(default_factory=StitchConfig)  # each planned as a piece; on_m of 0: none
     q_from: Array | None = None  # (6,) rad, above the end of the seam before; None: home
     order_words: str = ""  # of the seams
     configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
@@ -262,6 +264,8 @@ def plan_seam(
                 check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
                 if stops:
                     planning, seam, record, more = interrupted(planning, seam, stops, record)
+        if planning.stitches.on_m:
+            planning, seam, record, more = stitch_piece(planning, seam, record)
         arc = planning.config.touch.arc_m if record.left_out else None
         planning, seam, arc, again = gone_on(planning, seam, whole, found.X_BP, found.sigma_m, arc)
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
@@ -295,7 +299,8 @@ def plan_seam(
         )
     except WeldcalError as error:
         records = (*planning.earlier, record)
-        return PlannedSeam(sequence=scan.sequence, number=planning.number, reason=str(error), records=records)
+        number, piece = planning.number, planning.piece
+        return PlannedSeam(sequence=scan.sequence, number=number, piece=piece, reason=str(error), records=records)
 
 
 def planned_gap(planning: SeamPlanning, fit_up: FitUp | None, whole: SeamCurve, piece: SeamCurve) -> GapAlong | None:
@@ -336,6 +341,30 @@ def interrupted(
     arc = max(down - start, planning.config.touch.arc_m)
     planning = dc.replace(planning, config=leaning(planning.config, 0.0, arc))
     return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
+
+
+def stitch_piece(
+    planning: SeamPlanning, seam: SeamCurve, record: SeamRecord
+) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
+    """The stitch of a seam whose turn it is: its planning, its line, its record, and whether another one follows.
+
+    Raises:
+        StitchError: the seam is too short for a stitch.
+    """
+    pieces = planning.stitches.pieces(seam.length)
+    if planning.piece >= len(pieces):
+        raise StitchError(f"A seam of {1e3 * seam.length:.0f} mm has no room for a stitch: lower stitch.on_mm.")
+    config, chord, (start, end) = planning.config, planning.tool.chord_m, pieces[planning.piece]
+    last = min(seam.drawn_m, end + TIP_AHEAD * chord)
+    s = np.linspace(start, last, max(9, round((last - start) / 0.5e-3)))
+    line = SeamCurve.from_points(seam.position(s), up=seam.up(s), length=end - start if end < last else None)
+    arc = min(chord - RUN_UP_S * config.weld_speed_m_s, line.drawn_m - config.gap.end_window_m - SPARE_M)
+    if start > 0.0:  # the first one of the seam feels the seam's start
+        config = leaning(config, 0.0, max(arc, config.touch.arc_m))
+    edges = [0.0, *(s for piece in sorted(pieces) for s in piece), seam.length]
+    left_out = tuple((a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 1e-6)
+    record = dc.replace(record, left_out=left_out)
+    return dc.replace(planning, config=config), line, record, planning.piece + 1 < len(pieces)
 
 
 def gone_on(
@@ -425,6 +454,7 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
     return PlannedSeam(
         sequence=sequence,
         number=planning.number,
+        piece=planning.piece,
         direct=planning.q_from is not None and free_move(planning, planning.q_from, way.q_above, X_BP),
         seam=seam,
         X_BP=X_BP,

@@ -341,21 +341,24 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     def _retracted(self, s: JobState, now: JobInputs) -> JobState:
         if now.planned_seam.more:
-            return self._homeward(s, now, "park", piece=s.piece + 1)
+            return self._onward(s, now, piece=s.piece + 1)
         if s.weld_pass < len(self._plan.interpass_s):
             return self._homeward(s, now, "interpass", weld_pass=s.weld_pass + 1)
         order = self._plan.order
         later = order[order.index(s.seam) + 1 :]
         if not later:
             return self._homeward(s, now, "home")
+        return self._onward(s, now, seam=later[0], piece=0, weld_pass=0)
+
+    def _onward(self, s: JobState, now: JobInputs, **changes: int) -> JobState:
         if self._plan.direct:
-            return self.enter(s, now, "plan_seam", seam=later[0], piece=0, weld_pass=0)
+            return self.enter(s, now, "plan_seam", **changes)
         # The part is scanned again, for the seam that was welded may have moved it.
-        return self._homeward(s, now, "park", seam=later[0], piece=0, weld_pass=0)
+        return self._homeward(s, now, "park", **changes)
 
     def _next_planned(self, s: JobState, now: JobInputs) -> JobState:
         planned = now.planned_seam
-        if planned.number != s.seam:
+        if (planned.number, planned.piece) != (s.seam, s.piece):
             return s
         if planned.seam is None:
             return self.held(s, now, planned.reason or "The next seam could not be planned.")

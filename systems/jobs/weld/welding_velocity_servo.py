@@ -45,7 +45,7 @@ class ServoReport(Message):
     state: WeldingState | None = None
     time: float = np.nan  # of the robot's sample, on the Diagram's clock, s
     X_BT: RigidTransform | None = None  # measured at that tick
-    plan: tuple[int, int] = (0, 0)  # key of the plan that is followed
+    plan: tuple[int, int, int] = (0, 0, 0)  # key of the plan that is followed
     weld_pass: int = 0
     interruption: Interruption = dc.field(default_factory=Interruption)  # an operator's hold
 

@@ -182,12 +182,12 @@ def test_the_next_seam_is_planned_from_the_same_scan(
     X_BC = plain_station().truth.X_BC
     then = replace(JOB, phase="plan_seam", seam=1)
     found = planned(workpiece_scan, config, X_BC=X_BC, then=then)
-    assert (found.key, [record.seam for record in found.records]) == ((1, 1), [0, 1])
+    assert (found.key, [record.seam for record in found.records]) == ((1, 1, 0), [0, 1])
     assert found.direct, "above the plate nothing is in the way"
     assert found.seam is not None
     assert plan.seam is not None
     assert found.seam.position(0.05) == pytest.approx(plan.seam.position(0.05), abs=1e-9)
-    assert (plan.key, plan.direct) == ((1, 0), False)
+    assert (plan.key, plan.direct) == ((1, 0, 0), False)
 
 
 def test_the_plan_states_what_errors_of_the_arm_do(plan: PlannedSeam, config: ServoConfig) -> None:
