@@ -35,7 +35,7 @@ def plan_passes(
 ) -> Outcome:
     """Compute the beads of a wire feed and a speed, and print the passes after the root as lines for the scenario.
 
-    The metal is counted without loss, the weld's surface is level. The speed of the passes makes the joint exactly full.
+    The metal is counted without loss, and the surface is level. The speed of the passes makes the joint exactly full.
     """
     loaded = load_scenario(scenario)
     half, depth_m = _joint(loaded, seam, depth_mm)

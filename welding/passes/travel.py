@@ -10,7 +10,7 @@ from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 
 MOST_SEAMS = 8  # a choice: 40320 orders take about a second
-_ROUNDING_M = 1e-9
+_ROUNDING_M = 1e-9  # of the sums
 
 
 class SeamTravel(NamedTuple):
