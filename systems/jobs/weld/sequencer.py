@@ -42,7 +42,8 @@ class JobPlan:
     scan_timeout_s: float = SCAN_TIMEOUT_S
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
-    order: tuple[int, ...] = (0,)  # numbers of the seams, from 0, in the order of welding
+    seams: int = 1
+    order: tuple[int, ...] = ()  # their numbers, from 0, in the order of welding; empty: as listed
     direct: bool = False  # to the next seam without a new scan, and without home where the way is free
     interpass_s: tuple[float, ...] = ()  # of each pass after the root
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
@@ -166,7 +167,9 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         late = "{} arrived within {:.0f} s of its trigger. Look at the scanner."
         no_scan = (plan.scan_timeout_s, late.format("No scan", plan.scan_timeout_s))
         super().__init__(
-            JobState(seam=plan.order[0]) if plan.first is None else JobState(seam=plan.first[0], piece=plan.first[1]),
+            JobState(seam=(*plan.order, 0)[0])
+            if plan.first is None
+            else JobState(seam=plan.first[0], piece=plan.first[1]),
             move_timeout_s=plan.move_timeout_s,
             maximum_time_s=plan.maximum_time_s,
             timeouts={
@@ -344,7 +347,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             return self._onward(s, now, piece=s.piece + 1)
         if s.weld_pass < len(self._plan.interpass_s):
             return self._homeward(s, now, "interpass", weld_pass=s.weld_pass + 1)
-        order = self._plan.order
+        order = self._plan.order or tuple(range(self._plan.seams))
         later = order[order.index(s.seam) + 1 :]
         if not later:
             return self._homeward(s, now, "home")

@@ -331,7 +331,7 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=(job.maximum_time_s * slower * pieces * (1 + len(interpass_s)) + sum(interpass_s)) * seams,
-        order=tuple(range(seams)),
+        seams=seams,
         direct=scenario.welding.between_seams == "direct",
         interpass_s=interpass_s,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),

@@ -227,7 +227,7 @@ def test_a_scan_without_the_arms_pose_holds_the_job_at_once() -> None:
 
 
 def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:
-    world = World(dc.replace(PLAN, calibrate=False, order=(0, 1)))
+    world = World(dc.replace(PLAN, calibrate=False, seams=2))
     assert world.look() == "park"
     for number in (0, 1):
         assert world.arrive() == "scan_workpiece"
