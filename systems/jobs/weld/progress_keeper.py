@@ -78,10 +78,10 @@ class ProgressKeeper:
                 self._put(None)
             return
         report, planned = job.servo_report(root), job.planned_seam(root)
-        if report.plan != planned.key or planned.seam is None:
+        if report.plan_key != planned.key or planned.seam is None:
             return
-        if report.plan != self._plan:
-            self._plan, self._from_m, self._to_m, self._at = report.plan, math.nan, -math.inf, -math.inf
+        if report.plan_key != self._plan:
+            self._plan, self._from_m, self._to_m, self._at = report.plan_key, math.nan, -math.inf, -math.inf
         state = report.state
         lit = phase == "weld" and report.torch_on and state is not None and state.arc_seen
         if state is not None and (lit or self._lit):
