@@ -353,7 +353,8 @@ def stitch_piece(
     """
     pieces = planning.stitches.pieces(seam.length)
     if planning.piece >= len(pieces):
-        raise StitchError(f"A seam of {1e3 * seam.length:.0f} mm has no room for a stitch: lower stitch.on_mm.")
+        length = f"{1e3 * seam.length:.0f} mm"
+        raise StitchError(f"A seam of {length} is too short for a stitch: lower welding.stitch.on_mm.")
     config, chord, (start, end) = planning.config, planning.tool.chord_m, pieces[planning.piece]
     last = min(seam.drawn_m, end + TIP_AHEAD * chord)
     s = np.linspace(start, last, max(9, round((last - start) / 0.5e-3)))
