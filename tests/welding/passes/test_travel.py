@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from weldcal.welding.passes.travel import MOST_SEAMS, seam_travel
 HOME = (0.3, -0.4, 0.5)
 
 
-def way(seams: list[tuple[tuple[float, ...], tuple[float, ...]]], order: tuple[int, ...]) -> float:
+def way(seams: Sequence[tuple[tuple[float, ...], tuple[float, ...]]], order: tuple[int, ...]) -> float:
     """Length of the polyline home, first start; first end, next start; ...; last end, home."""
     at, total = HOME, 0.0
     for k in order:
