@@ -12,7 +12,7 @@ import pytest
 from weldcal.models.errors import InputError
 from weldcal.welding.passes.travel import MOST_SEAMS, seam_travel
 
-HOME = (0.3, -0.4, 0.5)
+HOME: tuple[float, ...] = (0.3, -0.4, 0.5)
 
 
 def way(seams: Sequence[tuple[tuple[float, ...], tuple[float, ...]]], order: tuple[int, ...]) -> float:
