@@ -2,12 +2,12 @@
 
 import dataclasses as dc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, expected_factors
@@ -22,7 +22,7 @@ from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, free_mov
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root_anyhow
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
@@ -35,39 +35,7 @@ from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
-_Z = (0.0, 0.0, 1.0)
 Views = tuple[ScanView, ...]
-
-
-def plan_root_anyhow(
-    points_B: npt.NDArray[np.floating] | list[Array],
-    workpiece: WeldPart,
-    X_BP_guess: RigidTransform,
-    method: PlanningMethod,
-    eye_B: Array,
-    up_B: Array,
-    plan: Callable[..., RootPlan] = plan_root,
-) -> RootPlan:
-    """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
-
-    Finding a part takes up for +z: the scan is turned about the base's origin, and the result is turned back.
-
-    Raises:
-        WeldcalError: as plan_root.
-    """
-    if tuple(up_B) == _Z:
-        return plan(points_B, workpiece, X_BP_guess, method, eye_B)
-    R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
-    X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
-    if method.start_B is not None:
-        x, y, z = X_UB @ np.array(method.start_B)
-        method = dc.replace(method, start_B=(x, y, z))
-    R_UB = X_UB.rotation().matrix()
-    turned = [p @ R_UB.T for p in points_B] if isinstance(points_B, list) else points_B @ R_UB.T
-    found = plan(turned, workpiece, X_UB @ X_BP_guess, method, eye_B @ R_UB.T)
-    R = R_BU.matrix()
-    X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
-    return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
