@@ -268,6 +268,9 @@ class PlannedSeam(Message):
     question: str = ""  # that an operator must answer before the arm goes there
     summary: str = ""  # the result of the scan, in one sentence
     weld_pass: int = 0  # number of the pass that it is for, 0: the root
+    number: int = 0  # of the seam, from 0
+    piece: int = 0  # number of its piece
+    direct: bool = False  # the way to it from the end of the last seam is free
     felt_line: SeamCurve | None = None  # of the tip in the root pass, for the passes after it
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and
     # torch at one place
@@ -276,6 +279,11 @@ class PlannedSeam(Message):
     # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
     lean_rad: float = 0.0
     gap: GapAlong | None = None  # along this plan, where the welding schedule follows it
+
+    @property
+    def key(self) -> tuple[int, int, int]:
+        """Numbers of the scan, the seam and its piece: several may be planned from one scan."""
+        return self.sequence, self.number, self.piece
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:

@@ -20,6 +20,7 @@ TEXT = {
     "retract": "retract",
     "interpass": "home, for the next pass",
     "plan_pass": "wait for the next pass",
+    "plan_seam": "plan the next seam",
     "home": "home",
     "done": "done",
     "held": "HELD: see the report",
@@ -59,7 +60,7 @@ STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
     ("Scan the part", "weld", ("move_to_scan", "scan_workpiece", "leave_scan")),
     ("Approach", "weld", ("confirm", "approach_above", "approach")),
     ("Weld", "weld", ("weld",)),
-    ("Go home", "weld", ("retract", "interpass", "plan_pass", "home")),
+    ("Go home", "weld", ("retract", "interpass", "plan_pass", "plan_seam", "home")),
 )
 """Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
 

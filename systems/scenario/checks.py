@@ -314,6 +314,22 @@ def check_tack_order(scenario: Scenario) -> None:
         raise InputError("welding.tacks goes with welding.law: guarded and without welding.pass_obstacles.")
 
 
+def check_seam_order(scenario: Scenario) -> None:
+    """Check the order of the seams and of their pieces; raises InputError."""
+    welding = scenario.welding
+    for name, known in (("seam_order", ("given", "least_travel")), ("between_seams", ("home", "direct"))):
+        if getattr(welding, name) not in known:
+            raise InputError(f"welding.{name} must be {' or '.join(known)}, not '{getattr(welding, name)}'.")
+    middle_out = welding.stitch is not None and welding.stitch.stitch().middle_out
+    if middle_out and (welding.tacks or welding.passes or welding.pass_obstacles):
+        raise InputError("welding.stitch.order: middle_out goes without welding.tacks, passes and pass_obstacles.")
+    if welding.seam_order == "least_travel" and welding.between_seams == "home":
+        raise InputError(
+            "welding.seam_order: least_travel saves nothing where the arm goes home after each seam: write"
+            " welding.between_seams: direct."
+        )
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -349,6 +365,7 @@ def check_scenario(scenario: Scenario) -> None:
     if scenario.welding.later_passes() and scenario.welding.pass_obstacles:
         raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
     check_tack_order(scenario)
+    check_seam_order(scenario)
     if scenario.welding.stitch is not None:
         scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()

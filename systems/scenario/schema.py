@@ -16,7 +16,7 @@ from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.passes.felt import WeldPass
-from weldcal.welding.passes.stitch import StitchConfig
+from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.schedule import WeldSchedule
@@ -178,10 +178,16 @@ class StitchOrder:
     on_mm: float = 30.0  # length of a piece; the seam's end may cut the last one to a half, a shorter rest is left out
     off_mm: float = 60.0  # from the end of a piece to the start of the next one
     from_mm: float = 0.0  # where the first piece starts, so that both sides of a web can be staggered
+    # along: all in one motion along the seam; middle_out: each by a touch of its own, from the middle to both ends by
+    # turns, so that the part bends evenly
+    order: str = "along"
 
     def stitch(self) -> StitchConfig:
         """The order as a StitchConfig."""
-        return StitchConfig(on_m=1e-3 * self.on_mm, off_m=1e-3 * self.off_mm, from_m=1e-3 * self.from_mm)
+        if self.order not in ("along", "middle_out"):
+            raise StitchError(f"welding.stitch.order must be along or middle_out, not '{self.order}'.")
+        on_m, off_m, from_m = 1e-3 * self.on_mm, 1e-3 * self.off_mm, 1e-3 * self.from_mm
+        return StitchConfig(on_m, off_m, from_m, self.order == "middle_out")
 
 
 @dc.dataclass(kw_only=True)
@@ -283,6 +289,9 @@ class WeldingConfig:
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
     # CSV of limits of gap, misalignment and angle along the seam: out of them it is not welded
     fit_up: str | None = dc.field(default=None, metadata=FILE)
+    seam_order: str = "given"  # given: as listed; least_travel: with the least way of the tool between the seams
+    # home: the arm goes home and scans the part again; direct: it goes to the next seam, by home only where it must
+    between_seams: str = "home"
     # where something that the drawing does not have is in the way, the seam is interrupted; else it is not welded
     pass_obstacles: bool = False
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded

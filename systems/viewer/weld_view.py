@@ -52,7 +52,7 @@ class WeldView:
 
     def __init__(self, meshcat: Meshcat, root: str, tool: WeldingTool, cad: TriMesh | None) -> None:
         self._meshcat, self._root, self._tool, self._cad = meshcat, root, tool, cad
-        self._seam, self._pieces, self._next = 0, 0, -np.inf
+        self._seam, self._pieces, self._next = (0, 0, 0), 0, -np.inf
         self._torch: list[Array] = []
         self._felt: list[Array] = []
         self._arrow, self._aside = False, np.zeros(3)
@@ -60,8 +60,8 @@ class WeldView:
 
     def draw(self, planned: PlannedSeam, servo: ServoReport, time: float) -> None:
         """Update the viewer with the newest plan and servo report."""
-        if planned.sequence > self._seam and planned.seam is not None:
-            self._seam = planned.sequence
+        if planned.key != self._seam and planned.seam is not None:
+            self._seam = planned.key
             s = np.arange(0.0, planned.seam.length, _DOTS_EVERY_M)
             line = np.asarray(planned.seam.position(s[s % (2.0 * _DASH_M) < _DASH_M]))
             self._path("seam/planned", line, SHOWN_ABOVE_M, PLANNED, time)

@@ -14,10 +14,9 @@ from weldcal.calibration.planning.clearance import arm_bodies, lowest_point
 from weldcal.models.arms.kinematics import link_frames, load_arm, mounted
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.jobs.weld.seam_planning import plan_root_anyhow
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station, table_in_base
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root_anyhow
 
 CEILING = "base: {xyz_m: [0.1, 0.0, 1.2], rpy_deg: [180.0, 0.0, 0.0]}\n"
 

@@ -248,13 +248,15 @@ welding:
     filler_batch: fb, gas: g, position: PA, note: n, limits: {heat_input_kJ_mm: [0.5, 1.0], speed_mm_s: [7.0, 9.0],
     current_A: [80.0, 100.0], voltage_V: [10.0, 12.0], path_mm: 0.4}}
   weave: {shape: crescent, amplitude_mm: 1.5, frequency_hz: 1.5, dwell_s: [0.1, 0.2], bow_mm: 0.5, plane_deg: 10.0}
-  stitch: {on_mm: 20.0, off_mm: 40.0, from_mm: 5.0}
+  stitch: {on_mm: 20.0, off_mm: 40.0, from_mm: 5.0, order: middle_out}
   tacks: [{from_mm: 50.0, to_mm: 60.0, height_mm: 5.0, seam: 2}]
   passes: [{lateral_mm: 1.0, vertical_mm: 3.0, angle_deg: 5.0, speed_mm_s: 9.0, reverse: true, interpass_s: 30.0}]
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4
   pass_obstacles: true
+  seam_order: least_travel
+  between_seams: direct
   fit_up: limits.csv
   posture: any
 job:

@@ -36,7 +36,7 @@ PANELS = {
         *("calibrate", "verify", "apply", "hand-eye", "profiler", "tablet", "plan-poses", "plan-motion"),
         *("doctor", "monitor", "fleet"),
     ),
-    "Weld": ("demo", "weld", "part", "new", "finger", "tool"),
+    "Weld": ("demo", "weld", "plan-passes", "part", "new", "finger", "tool"),
     "Robot": ("robots", "check-robot", "check-cell", "emulate-ur", "emulate-cell"),
     "Data": ("import", "export", "schema", "print-board"),
     "Look": ("view", "replay"),

@@ -1,14 +1,15 @@
 """Plans the groove's root from scans: by the drawing registered to them, or from the cloud alone."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.part import Part, WeldPart
@@ -196,3 +197,37 @@ def plan_root(
         confidence=confidence,
         summary=summary,
     )
+
+
+_Z = (0.0, 0.0, 1.0)
+
+
+def plan_root_anyhow(
+    points_B: npt.NDArray[np.floating] | list[Array],
+    workpiece: WeldPart,
+    X_BP_guess: RigidTransform,
+    method: PlanningMethod,
+    eye_B: Array,
+    up_B: Array,
+    plan: Callable[..., RootPlan] = plan_root,
+) -> RootPlan:
+    """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
+
+    Finding a part takes up for +z: the scan is turned about the base's origin, and the result is turned back.
+
+    Raises:
+        WeldcalError: as plan_root.
+    """
+    if tuple(up_B) == _Z:
+        return plan(points_B, workpiece, X_BP_guess, method, eye_B)
+    R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
+    X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
+    if method.start_B is not None:
+        x, y, z = X_UB @ np.array(method.start_B)
+        method = replace(method, start_B=(x, y, z))
+    R_UB = X_UB.rotation().matrix()
+    turned = [p @ R_UB.T for p in points_B] if isinstance(points_B, list) else points_B @ R_UB.T
+    found = plan(turned, workpiece, X_UB @ X_BP_guess, method, eye_B @ R_UB.T)
+    R = R_BU.matrix()
+    X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
+    return replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)

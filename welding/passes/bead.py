@@ -70,3 +70,25 @@ def propose_passes(
         found += [WeldPass(lateral_m=x, vertical_m=height) for x in places]
         filled += beads * area
     return found
+
+
+def filling_passes(
+    root_m2: float, area_m2: float, half_angle_rad: float, depth_m: float, widest_m: float = WIDEST_M
+) -> tuple[list[WeldPass], float]:
+    """The passes after the root that fill a wedge to its depth, and the area of each that fills it exactly, m^2.
+
+    Args:
+        root_m2: of the root's bead; area_m2: of a bead after it, near which the answer is.
+
+    Raises:
+        PassError: as propose_passes, or no number of beads of one area fills it.
+    """
+    rest = math.tan(half_angle_rad) * depth_m**2 - root_m2
+    if not propose_passes([root_m2, area_m2], half_angle_rad, depth_m, widest_m) or rest <= 0.0:
+        return [], area_m2
+    least = max(1, round(rest / area_m2))
+    for beads in range(least, least + MOST_BEADS):
+        passes = propose_passes([root_m2, rest / beads], half_angle_rad, depth_m, widest_m)
+        if len(passes) == beads:
+            return passes, rest / beads
+    raise PassError("No number of equal beads fills this joint: change the wire feed, the speed or the widest bead.")

@@ -29,11 +29,13 @@ class StitchConfig:
     Attributes:
         on_m, off_m: length of a piece, and of the pause after it.
         from_m: where the first piece starts.
+        middle_out: the piece in the middle is welded first, then one on either side by turns.
     """
 
     on_m: float = 0.0
     off_m: float = 0.0
     from_m: float = 0.0
+    middle_out: bool = False
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) and v >= 0.0 for v in (self.on_m, self.off_m, self.from_m)):
@@ -49,6 +51,17 @@ class StitchConfig:
                 f"A stitch and the pause after it must be at least {1e3 * least_m:.3g} mm long at"
                 f" {1e3 * speed_m_s:g} mm/s: raise on_mm and off_mm."
             )
+
+    def pieces(self, length_m: float) -> list[Stitch]:
+        """The pieces of a seam in the order of welding."""
+        found: list[Stitch] = []
+        at = 0.0
+        while at < length_m and (piece := self.piece(at, 0.0, length_m)) is not None:
+            found.append(piece)
+            at = piece.start + (self.on_m or length_m)
+        if self.middle_out:
+            found = [found[k] for k in sorted(range(len(found)), key=lambda k: (abs(2 * k - len(found) + 1), k))]
+        return found
 
     def piece(self, s: float, start: float, end: float) -> Stitch | None:
         """Return the first piece that ends beyond s m, on a seam from start to end m; None where there is none."""

@@ -11,6 +11,7 @@ from weldcal.welding.seam.refinement import drop_pending, refine, tip_point
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Measurement, Phase, ServoSample, WeldingState
 
+LEAST_POINTS = 5  # of a path that is fitted; before, the torch follows the plan
 _PRESSED = 0.9  # a choice: of the wanted deflections; a gain of 8 % less still passes
 
 
@@ -167,6 +168,13 @@ def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     refined = refine(state.refined, state.measurement.point, arc, config.refinement, is_corner)
     if len(refined) > len(state.refined):
         plan_fit = add_point(plan_fit, refined.points[-1], float(refined.arc[-1]), config.plan_fit)
+        if plan_fit is not state.plan_fit and len(state.refined) >= LEAST_POINTS:
+            # In a gap the torch's target must not move with the plan: the tool would roll with each new point.
+            was = state.plan_fit.curve.frame(state.s_torch)
+            now = plan_fit.curve.frame(plan_fit.curve.nearest(was.position, state.s_torch))
+            off = was.position - now.position
+            residual = state.residual + np.array((dot(off, now.normal), dot(off, now.up)))
+            state = changed(state, residual=residual)
     return changed(state, refined=refined, plan_fit=plan_fit, proven=proven)
 
 

@@ -369,7 +369,8 @@ class ServoConfig:
     @cached_property
     def hops(self) -> tuple[Hop, ...]:
         """The lifts of the tip over the tacks."""
-        return hops(self.tacks, self.weld_speed_m_s, self.deflection.axial_d_m)
+        chord, touch = self.tool.torch_offset_m, self.touch.arc_m
+        return hops(self.tacks, self.weld_speed_m_s, self.deflection.axial_d_m, chord, touch)
 
     def hop_at(self, s: float) -> Hop | None:
         """Return the lift that the tip is in at an arc length s m of the seam."""

@@ -291,7 +291,7 @@ def _weld(
     curve = state.plan_fit.curve
     p_BT = np.asarray(sample.X_BT.translation())
     at = p_BT
-    if state.phase == Phase.TRACK and state.measurement is not None:
+    if state.measurement is not None and (state.phase == Phase.TRACK or state.settling):
         # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
         at = state.measurement.point + (p_BT - state.measurement.p_BT)
     s_tip = curve.nearest(at, state.s_tip)
@@ -392,17 +392,19 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
-    wanted, rise = state.hold, 0.0
+    wanted, rise = state.hold, np.zeros(2)
     if state.phase == Phase.COAST:
         # after a tack the plan may have come off by more than over a gap: the tip comes down deeper
-        height = -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m
+        place = np.array((0.0, -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m))
         hop = config.hop_at(state.s_tip)
         if hop is not None:
-            height, slope = hop.place(state.s_tip, -deflection.axial_d_m, height)
+            # released as slowly to the side as it is lifted: the tool turns about the torch for both
+            pressed = np.array((deflection.delta_d_m, -deflection.axial_d_m))
+            place, slope = hop.place(state.s_tip, pressed, place)
             rise = slope * state.v_tip
-        wanted = state.residual_at_loss + np.array((0.0, height))
-    gap = wanted - off
-    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1]) + rise
+        wanted = state.residual_at_loss + place
+    lateral, upward = deflection.k_follow * (wanted - off) + rise
+    return float(lateral), float(upward)
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:

@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from weldcal.welding.numerics import Array, box_least_squares, changed, clip, cross, dot, norm, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
+from weldcal.welding.servo.contact import LEAST_POINTS
 from weldcal.welding.servo.guards import SeamConditioning, seam_conditioning
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
@@ -24,6 +25,7 @@ _BEND_OVER_M = (
 )  # least and most length of path whose bend is extrapolated; 0.4 of the plan's radius between
 _RISE = 0.05  # slope of the path against the plan's surface
 _WINDOW_M = 5.0e-3  # two sigma of the widest fit
+_PITCH_SHARE = 0.95  # a choice: the tip's speed is that of the tick before
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
@@ -70,7 +72,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     seam = state.refined
     residual, fit, arc = state.residual, None, state.torch_arc
     drift = np.zeros(2)
-    if len(seam) >= 5:
+    if len(seam) >= LEAST_POINTS:
         first, last = float(seam.arc[0]), float(seam.arc[-1])
         inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
         radius = 1.0 / max(abs(plan.curvature), 1e-6)
@@ -250,6 +252,11 @@ def guarded_motion(
     base = servo[0] * tip.normal + servo[1] * tip.up
     lean_n, lean_t = dot(a, n) / ab, dot(a, t) / ab
     up_v, up_w, up_0 = dot(tb, b), -d * dot(m_then, b), dot(base, b) - back_b
+    # The pitch that lifts or lowers the tip has its limit: the tip is the slower one, the torch keeps its height.
+    share, most = dot(tip.up, b), _PITCH_SHARE * limits.pitch_rate_max_rad_s * d * abs(ab)
+    wanted = state.v_tip * up_v + state.omega * up_w + up_0
+    slower = clip((wanted - clip(wanted, -most, most)) / max(share, 0.5), min(servo[1], 0.0), max(servo[1], 0.0))
+    base, up_0 = base - slower * tip.up, up_0 - slower * share
     n_v, n_w = dot(tb, n) - up_v * lean_n, -d * dot(m_then, n) - up_w * lean_n
     t_v, t_w = dot(tb, t) - up_v * lean_t, -d * dot(m_then, t) - up_w * lean_t
     n_0, t_0 = dot(base, n) - up_0 * lean_n, dot(base, t) - up_0 * lean_t

@@ -18,10 +18,11 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice, check_range
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
-from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_root_anyhow
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning
 from weldcal.systems.messages import JobCommand, Message, Scan
 from weldcal.systems.motion.guarded_path import check_path, straight
 from weldcal.systems.scenario.schema import FILE, Scenario
+from weldcal.welding.locate.planning import plan_root_anyhow
 from weldcal.welding.seam.curve import SeamCurve
 
 FEWEST, MOST = 3, 60

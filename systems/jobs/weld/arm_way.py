@@ -284,9 +284,7 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
     ends = [("above the seam", way.q_above, way.q_start), ("above the seam's end", seam.q[-1], way.q_retract)]
     # the arm stands at home: as far as its capsules overlap there, they are larger than its bodies
     least = min(0.0, self_distance(bodies, link_frames(arm, home)))
-    part = Surroundings()
-    if X_BP is not None and welder.workpiece is not None:
-        part = Surroundings((Obstacle("part", welder.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
+    part = _part(welder, X_BP)
     for move in (*moves, *ends, *weld):
         where, a, b = move
         if move in moves and part.touched_on_path(arm, bodies, a, b):
@@ -300,6 +298,27 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
         if name:
             problem = f"The arm or its tool would come too close to '{name}' {where}"
             raise SeamObstructed(problem, "move it or the workpiece, or correct surroundings in the scenario")
+
+
+def _part(welder: Welder, X_BP: RigidTransform | None) -> Surroundings:
+    if X_BP is None or welder.workpiece is None:
+        return Surroundings()
+    return Surroundings((Obstacle("part", welder.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
+
+
+def free_move(welder: Welder, q_a: Array, q_b: Array, X_BP: RigidTransform | None) -> bool:
+    """Whether a straight move in joint space (6,) rad between two seams of a known part is free.
+
+    It is checked against part, surroundings, table and the arm itself.
+    """
+    arm, bodies = welder.arm, arm_bodies(welder.arm, welder.tool.capsules())
+    if X_BP is None or any(
+        s.touched_on_path(arm, bodies, q_a, q_b) for s in (_part(welder, X_BP), welder.surroundings)
+    ):
+        return False
+    lowest, gap = path_clearance(arm, bodies, q_a, q_b)
+    least = min(0.0, self_distance(bodies, link_frames(arm, welder.q_near)))
+    return bool(gap >= least and lowest > welder.table_z_m)
 
 
 def _lifted(arm: ArmModel, seam: SeamCurve, X_BT: RigidTransform, height_m: float, s: float = 0.0) -> RigidTransform:

@@ -30,8 +30,10 @@ from weldcal.systems.jobs.weld.settings import (
     feature_on_flange,
     feature_standard,
     job_plan,
+    pieces_of,
     plan_poses,
     servo_config,
+    travel_of,
     work_point,
 )
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
@@ -47,6 +49,7 @@ from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.locate.part.joint import read_limits
+from weldcal.welding.passes.travel import SeamTravel
 from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
@@ -146,6 +149,7 @@ SHARES = {
     "retract": 0.96,
     "interpass": 0.97,
     "plan_pass": 0.97,
+    "plan_seam": 0.97,
     "home": 0.97,
     "done": 0.98,
     "held": 0.98,
@@ -165,7 +169,7 @@ class WeldJob(AddedJob):
     monitor: DriftMonitor | None
     seam: OutputPort
     report: OutputPort
-    seams: int = 1
+    travel: SeamTravel
     passes: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
@@ -205,13 +209,14 @@ class WeldJob(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         command = self.command(root)
-        phase, seams = command.phase, self.seams
+        phase, order = command.phase, self.travel.order
+        seams, seam = len(order), order.index(command.seam)
         share = SHARES.get(phase, 0.05)
         if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
-        welds, weld = seams * self.passes, command.seam * self.passes + command.weld_pass
-        counted = [("seam", command.seam, seams), ("pass", command.weld_pass, self.passes)]
+        welds, weld = seams * self.passes, seam * self.passes + command.weld_pass
+        counted = [("seam", seam, seams), ("pass", command.weld_pass, self.passes)]
         detail = ", ".join(f"{name} {k + 1} of {n}" for name, k, n in counted if n > 1)
         if share < SHARES["approach_above"]:
             detail = ""
@@ -244,7 +249,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         config = servo_config(scenario, station)
         X_FR, standard = feature_on_flange(scenario, station), feature_standard(scenario)
         X_BC_guess = c.mounting_guess.pose()
-        times = job_plan(scenario, station.cad)
+        travel = travel_of(scenario, station)
+        times = replace(job_plan(scenario, station.cad), order=travel.order)
         sequencer = wiring.add("job_sequencer", JobSequencer(times))
         command, history = sequencer.GetOutputPort("job"), spine.arm.history
         estimator = wiring.add(
@@ -304,7 +310,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             report=report,
             ports=ports,
             maximum_time_s=times.maximum_time_s,
-            seams=times.seams,
+            travel=travel,
             passes=1 + len(times.interpass_s),
         )
 
@@ -338,6 +344,9 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         passes=welding.later_passes(),
         limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
         schedule=welding.schedule,
+        keeps_scan=welding.between_seams == "direct",
+        stitches=pieces_of(welding),
+        order_words=travel_of(scenario, station).words,
     )
 
 

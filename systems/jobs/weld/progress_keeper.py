@@ -53,7 +53,7 @@ class ProgressKeeper:
         """
         self._folder, self._files, self._progress = folder, files, begun
         self._from_m, self._to_m, self._at, self._time = math.nan, -math.inf, -math.inf, -math.inf
-        self._plan, self._ended, self._lit = 0, 0, False
+        self._plan, self._ended, self._lit = (0, 0, 0), (0, 0, 0), False
         self._slot: tuple[Progress, WeldingState | None] | None = None
         self._changed, self._closing = threading.Condition(), False
         self._thread: threading.Thread | None = None
@@ -79,10 +79,10 @@ class ProgressKeeper:
                 self._put(None)
             return
         report, planned = job.servo_report(root), job.planned_seam(root)
-        if report.plan != planned.sequence or planned.seam is None:
+        if report.plan_key != planned.key or planned.seam is None:
             return
-        if report.plan != self._plan:
-            self._plan, self._from_m, self._to_m, self._at = report.plan, math.nan, -math.inf, -math.inf
+        if report.plan_key != self._plan:
+            self._plan, self._from_m, self._to_m, self._at = report.plan_key, math.nan, -math.inf, -math.inf
         state = report.state
         lit = phase == "weld" and report.torch_on and state is not None and state.arc_seen
         if state is not None and (lit or self._lit):
@@ -118,8 +118,10 @@ class ProgressKeeper:
 
     def _finished(self, planned: PlannedSeam, run: Run[WeldJob]) -> None:
         command, found = run.command, self._progress.with_stretch(self._stretch(run, done=True))
-        seam, piece = (command.seam, command.piece + 1) if planned.more else (command.seam + 1, 0)
-        done = seam >= run.cell.job.seams
+        order = run.cell.job.travel.order
+        later = (*order[order.index(command.seam) + 1 :], len(order))
+        seam, piece = (command.seam, command.piece + 1) if planned.more else (later[0], 0)
+        done = seam >= len(order)
         self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, felt=None)
         self._put(None)
 

@@ -65,7 +65,11 @@ class SeamPlanner(BackgroundSystem):
             planning = self._planning.of_seam(job.seam)
             report: ServoReport = self._report.Eval(context)
             return self.background.ask(plan_pass, planning, newest, job.weld_pass, report.state)
-        if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
+        follows = job.phase == "plan_seam"
+        if follows and ((job.seam, job.piece) == newest.key[1:] or newest.reason is not None):
+            return None
+        old = scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece"
+        if old and not follows:
             return None
         X_BC, correction, planning = self._X_BC_known, ScannerCorrection(), self._planning
         if self._X_FC_known is not None:
@@ -82,6 +86,9 @@ class SeamPlanner(BackgroundSystem):
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
         planning = dc.replace(planning.of_seam(job.seam), piece=job.piece, earlier=newest.records)
+        if follows:
+            views = newest.views or (ScanView(scan, X_BC),)
+            return self.plan(dc.replace(planning, q_from=newest.q_retract), views, correction)
         views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
         if job.view + 1 < job.views and X_BC is not None:
             return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views, records=newest.records))

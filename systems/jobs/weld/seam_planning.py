@@ -2,12 +2,12 @@
 
 import dataclasses as dc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, expected_factors
@@ -18,60 +18,30 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_clearance
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, free_move, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root_anyhow
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
+from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.restart import Restart
+from weldcal.welding.seam.restart import SPARE_M, Restart
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
-_Z = (0.0, 0.0, 1.0)
 Views = tuple[ScanView, ...]
-
-
-def plan_root_anyhow(
-    points_B: npt.NDArray[np.floating] | list[Array],
-    workpiece: WeldPart,
-    X_BP_guess: RigidTransform,
-    method: PlanningMethod,
-    eye_B: Array,
-    up_B: Array,
-    plan: Callable[..., RootPlan] = plan_root,
-) -> RootPlan:
-    """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
-
-    Finding a part takes up for +z: the scan is turned about the base's origin, and the result is turned back.
-
-    Raises:
-        WeldcalError: as plan_root.
-    """
-    if tuple(up_B) == _Z:
-        return plan(points_B, workpiece, X_BP_guess, method, eye_B)
-    R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
-    X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
-    if method.start_B is not None:
-        x, y, z = X_UB @ np.array(method.start_B)
-        method = dc.replace(method, start_B=(x, y, z))
-    R_UB = X_UB.rotation().matrix()
-    turned = [p @ R_UB.T for p in points_B] if isinstance(points_B, list) else points_B @ R_UB.T
-    found = plan(turned, workpiece, X_UB @ X_BP_guess, method, eye_B @ R_UB.T)
-    R = R_BU.matrix()
-    X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
-    return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 TACK_BESIDE_M = 3e-3  # a choice: about a tack, above what a scan and a list are off along the seam
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
+_DRAWN = "the pose of the part is from the fixture's drawing; the scan was not used"
 UNFELT = "followed from the scan and the drawing; not felt"
 
 
@@ -106,6 +76,10 @@ class SeamPlanning(Welder):
     restart: Restart | None = None  # the weld goes on there
     earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
     passes: tuple[WeldPass, ...] = ()  # after the root
+    keeps_scan: bool = False  # for the next seam
+    stitches: StitchConfig = dc.field(default_factory=StitchConfig)  # each planned as a piece; on_m of 0: none
+    q_from: Array | None = None  # (6,) rad, above the end of the seam before; None: home
+    order_words: str = ""  # of the seams
     configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
 
     def goes_on(self) -> bool:
@@ -237,6 +211,7 @@ def plan_seam(
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
     record, more = SeamRecord(planning.number), False
+    kept = (*views, ScanView(scan, X_BC)) if planning.keeps_scan else ()
     try:
         found = plan_root_anyhow(
             scans if views else points_B,
@@ -257,6 +232,8 @@ def plan_seam(
                 check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
                 if stops:
                     planning, seam, record, more = interrupted(planning, seam, stops, record)
+        if planning.stitches.on_m:
+            planning, seam, record, more = stitch_piece(planning, seam, record)
         arc = planning.config.touch.arc_m if record.left_out else None
         planning, seam, arc, again = gone_on(planning, seam, whole, found.X_BP, found.sigma_m, arc)
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
@@ -270,6 +247,8 @@ def plan_seam(
         summary = f"{found.summary}; with scanner and arm its sigma is {1e3 * sigma_m:.2f} mm"
         if not felt:
             sigma_m, summary = unfelt_sigma(planning, found, at, others)
+        if planning.order_words:
+            summary += f"; {planning.order_words}"
         return dc.replace(
             plan,
             felt=felt,
@@ -279,6 +258,7 @@ def plan_seam(
             part_sigma_m=found.sigma_m,
             **again,
             gap=planned_gap(planning, found.fit_up, whole, seam),
+            views=kept,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
@@ -286,7 +266,9 @@ def plan_seam(
             summary=summary,
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=scan.sequence, reason=str(error), records=(*planning.earlier, record))
+        records = (*planning.earlier, record)
+        number, piece = planning.number, planning.piece
+        return PlannedSeam(sequence=scan.sequence, number=number, piece=piece, reason=str(error), records=records)
 
 
 def planned_gap(planning: SeamPlanning, fit_up: FitUp | None, whole: SeamCurve, piece: SeamCurve) -> GapAlong | None:
@@ -327,6 +309,31 @@ def interrupted(
     arc = max(down - start, planning.config.touch.arc_m)
     planning = dc.replace(planning, config=leaning(planning.config, 0.0, arc))
     return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
+
+
+def stitch_piece(
+    planning: SeamPlanning, seam: SeamCurve, record: SeamRecord
+) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
+    """The stitch of a seam whose turn it is: its planning, its line, its record, and whether another one follows.
+
+    Raises:
+        StitchError: the seam is too short for a stitch.
+    """
+    pieces = planning.stitches.pieces(seam.length)
+    if planning.piece >= len(pieces):
+        length = f"{1e3 * seam.length:.0f} mm"
+        raise StitchError(f"A seam of {length} is too short for a stitch: lower welding.stitch.on_mm.")
+    config, chord, (start, end) = planning.config, planning.tool.chord_m, pieces[planning.piece]
+    last = min(seam.drawn_m, end + TIP_AHEAD * chord)
+    s = np.linspace(start, last, max(9, round((last - start) / 0.5e-3)))
+    line = SeamCurve.from_points(seam.position(s), up=seam.up(s), length=end - start if end < last else None)
+    arc = min(chord - RUN_UP_S * config.weld_speed_m_s, line.drawn_m - config.gap.end_window_m - SPARE_M)
+    if start > 0.0:  # the first one of the seam feels the seam's start
+        config = leaning(config, 0.0, max(arc, config.touch.arc_m))
+    edges = [0.0, *(s for piece in sorted(pieces) for s in piece), seam.length]
+    left_out = tuple((a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 1e-6)
+    record = dc.replace(record, left_out=left_out)
+    return dc.replace(planning, config=config), line, record, planning.piece + 1 < len(pieces)
 
 
 def gone_on(
@@ -415,6 +422,9 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
     share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
         sequence=sequence,
+        number=planning.number,
+        piece=planning.piece,
+        direct=planning.q_from is not None and free_move(planning, planning.q_from, way.q_above, X_BP),
         seam=seam,
         X_BP=X_BP,
         q_start=way.q_start,
@@ -480,7 +490,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
             rms_m=0.0,
             confidence=1.0,
             points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),
-            summary="the pose of the part is from the fixture's drawing; the scan was not used",
+            summary="; ".join(filter(None, (_DRAWN, planning.order_words))),
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=sequence, reason=str(error), records=records)
+        return PlannedSeam(sequence=sequence, number=planning.number, reason=str(error), records=records)

@@ -20,10 +20,10 @@ NOT_HOME = (
     " the pendant, then resume the weld again."
 )
 SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
-WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "interpass", "plan_pass", "home")
-"""Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
-WELDED = ("weld", "retract", "interpass", "plan_pass", "home")
+WELDED = ("weld", "retract", "interpass", "plan_pass", "plan_seam", "home")
 """Phases in which a scanner that has moved is a warning: nothing that follows depends on its pose."""
+WATCHED = ("move_to_verify", "park", "approach_above", "approach", *WELDED)
+"""Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
 
 
 @dc.dataclass(frozen=True, kw_only=True)
@@ -43,6 +43,8 @@ class JobPlan:
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
     seams: int = 1
+    order: tuple[int, ...] = ()  # their numbers, from 0, in the order of welding; empty: as listed
+    direct: bool = False  # to the next seam without a new scan, and without home where the way is free
     interpass_s: tuple[float, ...] = ()  # of each pass after the root
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
     first: tuple[int, int] | None = None  # seam and piece with which a broken weld goes on; None: a new weld
@@ -165,7 +167,9 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         late = "{} arrived within {:.0f} s of its trigger. Look at the scanner."
         no_scan = (plan.scan_timeout_s, late.format("No scan", plan.scan_timeout_s))
         super().__init__(
-            JobState() if plan.first is None else JobState(seam=plan.first[0], piece=plan.first[1]),
+            JobState(seam=(*plan.order, 0)[0])
+            if plan.first is None
+            else JobState(seam=plan.first[0], piece=plan.first[1]),
             move_timeout_s=plan.move_timeout_s,
             maximum_time_s=plan.maximum_time_s,
             timeouts={
@@ -340,14 +344,28 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     def _retracted(self, s: JobState, now: JobInputs) -> JobState:
         if now.planned_seam.more:
-            return self._homeward(s, now, "park", piece=s.piece + 1)
+            return self._onward(s, now, piece=s.piece + 1)
         if s.weld_pass < len(self._plan.interpass_s):
             return self._homeward(s, now, "interpass", weld_pass=s.weld_pass + 1)
-        number = s.seam + 1
-        if number < self._plan.seams:
-            # The part is scanned again, for the seam that was welded may have moved it.
-            return self._homeward(s, now, "park", seam=number, piece=0, weld_pass=0)
-        return self._homeward(s, now, "home")
+        order = self._plan.order or tuple(range(self._plan.seams))
+        later = order[order.index(s.seam) + 1 :]
+        if not later:
+            return self._homeward(s, now, "home")
+        return self._onward(s, now, seam=later[0], piece=0, weld_pass=0)
+
+    def _onward(self, s: JobState, now: JobInputs, **changes: int) -> JobState:
+        if self._plan.direct:
+            return self.enter(s, now, "plan_seam", **changes)
+        # The part is scanned again, for the seam that was welded may have moved it.
+        return self._homeward(s, now, "park", **changes)
+
+    def _next_planned(self, s: JobState, now: JobInputs) -> JobState:
+        planned = now.planned_seam
+        if (planned.number, planned.piece) != (s.seam, s.piece):
+            return s
+        if planned.seam is None:
+            return self.held(s, now, planned.reason or "The next seam could not be planned.")
+        return self._approach(s, now) if planned.direct else self._homeward(s, now, "leave_scan")
 
     def _at_home(self, s: JobState, now: JobInputs) -> JobState:
         return self.enter(s, now, "plan_pass")
@@ -380,6 +398,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         "retract": _retracted,
         "interpass": _at_home,
         "plan_pass": _pass_planned,
+        "plan_seam": _next_planned,
         "home": Procedure.end,
     }
 

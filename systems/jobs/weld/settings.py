@@ -15,6 +15,7 @@ from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_pos
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
@@ -25,10 +26,11 @@ from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
 from weldcal.systems.scenario.checks import check_home
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import Scenario, WeldingConfig
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.passes.tacks import Tack
+from weldcal.welding.passes.travel import SeamTravel, seam_travel
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
@@ -158,7 +160,7 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
         tacks=tacks,
-        stitch=StitchConfig() if welding.stitch is None else welding.stitch.stitch(),
+        stitch=StitchConfig() if welding.stitch is None or pieces_of(welding).on_m else welding.stitch.stitch(),
         windows=SeamWindows.of(tool),
         felt=felt,
         torch=TorchControl(
@@ -316,7 +318,10 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     c, job = scenario.calibration, scenario.job
     listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
     seams = max(1, listed if cad is None else seam_count(cad))
-    pieces = 2 if scenario.welding.pass_obstacles else 1
+    pieces, stitches = 2 if scenario.welding.pass_obstacles else 1, pieces_of(scenario.welding)
+    if stitches.on_m and cad is not None:
+        lines = [np.diff(numbered(cad, k).seam_P, axis=0) for k in range(seams)]
+        pieces = max(len(stitches.pieces(float(np.linalg.norm(line, axis=1).sum()))) for line in lines)
     interpass_s = tuple(order.interpass_s for order in scenario.welding.later_passes())
     slower = 1.0 / job.speed_factor
     return JobPlan(
@@ -332,9 +337,30 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=(job.maximum_time_s * slower * pieces * (1 + len(interpass_s)) + sum(interpass_s)) * seams,
         seams=seams,
+        direct=scenario.welding.between_seams == "direct",
         interpass_s=interpass_s,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )
+
+
+def pieces_of(welding: WeldingConfig) -> StitchConfig:
+    """The stitches that are planned as pieces of their own; on_m of 0: none."""
+    stitch = StitchConfig() if welding.stitch is None else welding.stitch.stitch()
+    if not stitch.middle_out:
+        return StitchConfig()
+    stitch.check(1e-3 * welding.speed_mm_s)
+    return stitch
+
+
+def travel_of(scenario: Scenario, station: Station) -> SeamTravel:
+    """The order of the seams, by the places where they are drawn."""
+    spec, cad, tool, welding = scenario.workpiece, station.cad, station.tool, scenario.welding
+    if spec is None or cad is None or tool is None:
+        return SeamTravel((0,), 0.0, 0.0)
+    ends = np.array([numbered(cad, k).seam_P[[0, -1]] for k in range(seam_count(cad))])
+    ends = ends @ spec.pose_guess.pose().rotation().matrix().T + spec.pose_guess.pose().translation()
+    home = (forward_kinematics(station.arm, np.deg2rad(scenario.home_deg)) @ tool.X_FT).translation()
+    return seam_travel(ends[:, 0], ends[:, 1], np.asarray(home), welding.seam_order == "least_travel")
 
 
 def calibrator_config(scenario: Scenario) -> CalibratorConfig:

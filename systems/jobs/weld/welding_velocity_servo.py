@@ -46,6 +46,7 @@ class ServoReport(Message):
     time: float = np.nan  # of the robot's sample, on the Diagram's clock, s
     X_BT: RigidTransform | None = None  # measured at that tick
     plan: int = 0  # sequence of the plan that is followed
+    plan_key: tuple[int, int, int] = (0, 0, 0)  # of the same: several are made from one scan
     weld_pass: int = 0
     interruption: Interruption = dc.field(default_factory=Interruption)  # an operator's hold
 
@@ -126,7 +127,7 @@ class WeldingVelocityServo(LeafSystem):
         old: ServoReport = context.get_abstract_state(self._state).get_value()
         planned: PlannedSeam = self._seam.Eval(context)
         if job.mode != "weld" or planned.seam is None:
-            newer = (planned.sequence, planned.weld_pass) > (old.plan, old.weld_pass)
+            newer = (planned.key, planned.weld_pass) != (old.plan_key, old.weld_pass)
             if old.phase == Phase.DONE and newer and planned.seam is not None:
                 # The next seam or pass is planned: what is reported of the last one would end it at once.
                 state.get_mutable_abstract_state(self._state).set_value(ServoReport())
@@ -156,6 +157,7 @@ class WeldingVelocityServo(LeafSystem):
             time=sample.time,
             X_BT=sample.X_BT,
             plan=planned.sequence,
+            plan_key=planned.key,
             weld_pass=planned.weld_pass,
             interruption=held,
         )

@@ -16,12 +16,13 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
 from tests.systems.placements import Placement, draw, follow, offered, placed
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import extrude, merge
 from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_clearance
+from weldcal.systems.jobs.weld.arm_way import Welder, find_way, free_move, leans_with_clearance
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, seam_above
 from weldcal.systems.jobs.weld.settings import servo_config
@@ -85,7 +86,31 @@ def test_the_advised_branch_works() -> None:
     assert drawn(0.65, 90.0, "welding: {posture: any}", z=0.6).reason is None
 
 
-@pytest.mark.parametrize(("key", "names"), [("lean_deg: 11", "lean_deg"), ("posture: other", "posture")])
+def test_a_post_in_the_way_to_the_next_seam_or_an_unknown_part_sends_the_arm_home() -> None:
+    base, plan = planning(), drawn(0.65, 90.0)
+    assert plan.q_above is not None
+    assert plan.q_retract is not None
+    ends = plan.q_retract, plan.q_above
+    assert free_move(base, *ends, plan.X_BP)
+    assert not free_move(base, *ends, None)
+    tip = forward_kinematics(base.arm, 0.5 * (ends[0] + ends[1])) @ base.tool.X_FT
+    square = np.array([(-0.01, -0.01), (0.01, -0.01), (0.01, 0.01), (-0.01, 0.01)])
+    post = Obstacle("post", extrude(square, -0.01, 0.01).transformed(RigidTransform(tip.translation())))
+    assert not free_move(replace(base, surroundings=Surroundings((post,))), *ends, plan.X_BP)
+    assert base.workpiece is not None
+    on_part = replace(base.workpiece, mesh=post.mesh.transformed(plan.X_BP.inverse())) if plan.X_BP else None
+    assert not free_move(replace(base, workpiece=on_part), *ends, plan.X_BP)
+
+
+@pytest.mark.parametrize(
+    ("key", "names"),
+    [
+        ("lean_deg: 11", "lean_deg"),
+        ("posture: other", "posture"),
+        ("seam_order: other", "seam_order"),
+        ("between_seams: other", "between_seams"),
+    ],
+)
 def test_a_setting_that_is_none_is_refused(key: str, names: str) -> None:
     with pytest.raises(InputError, match=f"welding.{names} must be"):
         check_scenario(scenario(f"welding: {{{key}}}"))

@@ -144,7 +144,7 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.arrive() == "done"
     assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
     passed = [phase for _, phase in world.state.log]
-    others = {"move_home", "move_to_scan", "leave_scan", "interpass", "plan_pass", "confirm"}
+    others = {"move_home", "move_to_scan", "leave_scan", "interpass", "plan_pass", "plan_seam", "confirm"}
     assert {*PHASES, "done"} == {*passed, *others}, "it stood at home already, and one pass was ordered"
 
 
@@ -240,6 +240,33 @@ def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:
         assert world.arrive() == ("home" if number else "park")
         world.now = dc.replace(world.now, servo_report=ServoReport())
     assert world.arrive() == "done"
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_the_next_seam_of_the_order_is_planned_where_the_arm_is(free: bool) -> None:
+    plan = dc.replace(PLAN, calibrate=False, order=(2, 0, 1), direct=True)
+    begun = JobSequencer(plan)
+    world = World(plan, begun.state_in(begun.CreateDefaultContext()))
+    world.look()
+    world.arrive()
+    assert world.command.seam == 2
+    assert world.look(0.3, planned_seam=dc.replace(PLANNED, sequence=1, number=2)) == "approach_above"
+    for number in (0, 1):
+        world.arrive()
+        assert world.arrive() == "weld"
+        assert world.look(20.0, servo_report=ServoReport(phase="DONE")) == "retract"
+        assert world.arrive() == "plan_seam"
+        assert (world.command.mode, world.command.seam, world.command.scan_sequence) == ("hold", number, 1)
+        assert world.look(1.0, servo_report=ServoReport()) == "plan_seam", "the plan of the seam before is no plan"
+        planned = dc.replace(PLANNED, sequence=1, number=number, direct=free)
+        assert world.look(1.0, planned_seam=planned) == ("approach_above" if free else "leave_scan")
+        if not free:
+            assert world.command.q_goal is Q_HOME
+            assert world.arrive() == "approach_above"
+    world.arrive()
+    world.arrive()
+    world.look(20.0, servo_report=ServoReport(phase="DONE"))
+    assert world.arrive() == "home"
 
 
 @pytest.mark.parametrize("calibrate", [True, False])

@@ -55,8 +55,12 @@ def planned(
     X_BC: RigidTransform | None = None,
     offset_m: float = 0.0,
     method: PlanningMethod | None = None,
+    then: JobCommand | None = None,
 ) -> PlannedSeam:
-    """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree."""
+    """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree.
+
+    then: of the job afterwards, for the answer of another kind.
+    """
     error = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(1.0)), [0.004 + offset_m, -0.003, 0.0])
     planning = SeamPlanning(
         arm=the_arm(),
@@ -68,6 +72,7 @@ def planned(
         clearance_m=CLEARANCE_M,
         seam_length_m=0.1,
         method=method or PlanningMethod(),
+        keeps_scan=then is not None,
     )
     system = SeamPlanner(planning, X_BC)
     simulator = Simulator(system)
@@ -75,6 +80,9 @@ def planned(
     for name, value in {"scan": scan, "job": job, "calibration_status": CalibrationStatus()}.items():
         system.GetInputPort(name).FixValue(context, AbstractValue.Make(value))
     simulator.AdvanceTo(0.01)
+    if then is not None:
+        system.GetInputPort("job").FixValue(context, AbstractValue.Make(then))
+        simulator.AdvanceTo(0.05)
     answer: PlannedSeam = system.GetOutputPort("planned_seam").Eval(context)
     return answer
 
@@ -166,6 +174,20 @@ def test_the_plan_holds_the_arms_way_to_it(plan: PlannedSeam, config: ServoConfi
     assert plan.q_start == pytest.approx(expected[0])
     assert plan.q_above == pytest.approx(expected[1])
     assert plan.q_retract == pytest.approx(expected[2])
+
+
+def test_the_next_seam_is_planned_from_the_same_scan(
+    workpiece_scan: Scan, config: ServoConfig, plan: PlannedSeam
+) -> None:
+    X_BC = plain_station().truth.X_BC
+    then = replace(JOB, phase="plan_seam", seam=1)
+    found = planned(workpiece_scan, config, X_BC=X_BC, then=then)
+    assert (found.key, [record.seam for record in found.records]) == ((1, 1, 0), [0, 1])
+    assert found.direct, "above the plate nothing is in the way"
+    assert found.seam is not None
+    assert plan.seam is not None
+    assert found.seam.position(0.05) == pytest.approx(plan.seam.position(0.05), abs=1e-9)
+    assert (plan.key, plan.direct) == ((1, 0, 0), False)
 
 
 def test_the_plan_states_what_errors_of_the_arm_do(plan: PlannedSeam, config: ServoConfig) -> None:

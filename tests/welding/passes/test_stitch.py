@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -67,3 +68,22 @@ def test_a_stitch_whose_torch_is_off_the_seam_is_a_fault() -> None:
     run = simulate(TrueSeam("s", s_curve(), UP), NOMINAL, replace(config, weld_speed_m_s=0.016), seed=4)
     assert run.phase == Phase.FAULT
     assert "arc is not lit" in str(run.reason)
+
+
+@pytest.mark.parametrize("length", [0.02, 0.04, 0.1, 0.2, 0.3, 0.61])
+def test_from_the_middle_outwards_no_side_is_ahead_by_more_than_a_piece(length: float) -> None:
+    along = StitchConfig(on_m=0.03, off_m=0.045, from_m=0.005).pieces(length)
+    assert along == sorted(along)
+    ordered = StitchConfig(on_m=0.03, off_m=0.045, from_m=0.005, middle_out=True).pieces(length)
+    assert sorted(ordered) == along, "the same pieces"
+    middle = 0.5 * (along[0].start + along[-1].end) if along else 0.0
+    pitch = 0.075
+    for k in range(1, len(ordered) + 1):
+        # what is welded is one stretch, whose middle stays within half a pitch of the seam's
+        done = sorted(ordered[:k])
+        assert all(b.start - a.start == pytest.approx(pitch) for a, b in pairwise(done))
+        assert abs(0.5 * (done[0].start + done[-1].end) - middle) < 0.5 * pitch + 0.015
+
+
+def test_a_seam_without_stitches_is_one_piece() -> None:
+    assert StitchConfig().pieces(0.2) == [(0.0, 0.2)]
