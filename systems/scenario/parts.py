@@ -132,7 +132,9 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
     first, *others = (
-        dc.replace(leg, feel=seam.feel) for seam in spec.seams for leg in legs(shape, source(seam), spec.joint)
+        dc.replace(leg, feel=seam.feel, listed=k)
+        for k, seam in enumerate(spec.seams)
+        for leg in legs(shape, source(seam), spec.joint)
     )
     return Part(shape, first, tuple(others))
 

@@ -15,6 +15,7 @@ from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.clearance import check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, check_feasible
+from weldcal.welding.servo.angles import angles_along, held
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, DeflectionControl, ServoConfig, ToolGeometry
 
 TRAVEL_MARGIN_RAD = math.radians(3.0)  # the weld stops 5 deg beyond the window: 2 deg are left for the plan's error
@@ -94,7 +95,8 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     """Compute how the servo moves the tool along a planned seam, from the touch to the torch at the seam's end.
 
     The tip's rest point leads: it is pressed aside and down by the wanted deflections. The torch trails by the chord,
-    at its height. The lean across the chord is the wanted work angle against the surface at the torch.
+    at its height. The lean across the chord is the wanted work angle against the surface at the torch, or the wire has
+    its ordered angles.
 
     Args:
         plan: the planned seam in B.
@@ -114,7 +116,11 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     # in T the chord is (d, 0, -h), and (h, 0, d) is square to it and to y
     e, d, h = np.cross(u, y), tool.torch_offset_m, tool.torch_height_m
     x, z = (d * u + h * e) / math.hypot(d, h), (d * e - h * u) / math.hypot(d, h)
-    poses = [pose(np.column_stack([x[k], y[k], z[k]]), rest[k]) for k in range(len(tip))]
+    R = np.stack([x, y, z], axis=2)
+    if config.angles is not None:
+        found = held(line, config)
+        rest, R = found.rest, found.R_BT
+    poses = [pose(R[k], rest[k]) for k in range(len(tip))]
     steps = np.hypot(np.diff(tip), np.diff(torch))
     speed = np.maximum(np.hypot(chart.tip_speed, chart.torch_speed), 1e-6)
     time = np.concatenate([[0.0], np.cumsum(2.0 * steps / (speed[1:] + speed[:-1]))])
@@ -134,8 +140,11 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
     The pressed tip's rest point is deeper in the joint than the torch.
 
     Raises:
-        InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD.
+        InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD, or see angles_along.
     """
+    if config.angles is not None:
+        angles_along(plan, config)
+        return
     tool, windows = config.tool, config.windows
     line, path = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan, tool_path(plan, config)
     tip, chord = path.s_tip, math.hypot(tool.torch_offset_m, tool.torch_height_m)

@@ -31,6 +31,7 @@ from weldcal.systems.jobs.weld.settings import (
     feature_standard,
     job_plan,
     plan_poses,
+    seam_tool,
     servo_config,
     work_point,
 )
@@ -318,9 +319,11 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     # a live calibration states its own
     speeds = () if welding.schedule is None else welding.schedule.speeds_m_s()
     sigma_mm = scenario.calibration.required_error_mm if scenario.job.calibrate else scenario.job.X_BC_sigma_mm
+    tools = [seam_tool(scenario, station, k) for k in range(seam_count(station.cad))]
     return SeamPlanning(
         arm=station.arm,
-        tool=station.tool,
+        tool=tools[0],
+        tools=tuple(tools),
         workpiece=station.cad,
         X_BP_guess=spec.pose_guess.pose(),
         config=replace(config, weld_speed_m_s=max(speeds)) if speeds else config,  # the arm must follow the fastest

@@ -141,6 +141,8 @@ class WeldingVelocityServo(LeafSystem):
         memory = old.state if old.state is not None else start_state(planned.felt_before)
         config = self._configs[min(job.seam, len(self._configs) - 1)][planned.weld_pass]
         config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
+        if planned.along is not None:
+            config = planned.along.at(config, memory.s_tip, memory.s_torch)
         if self._schedule is not None:
             config = at_gap(config, self._schedule, planned.gap, memory)
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
