@@ -18,7 +18,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import seated_tip, work_point
+from weldcal.systems.jobs.weld.settings import seam_tool, seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.messages import SeamRecord
 from weldcal.systems.runner import Run
@@ -194,6 +194,10 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
     p_BRobot = columns(named, "p_BT")
     q = columns(named, "q_BT", "wxyz")
+    # the wire's end with the stick-out that was ordered for the seam, against that of the tool
+    scenario, station, records = cell.scenario, cell.station, cell.job.planned_seam(root).records
+    of = [seam_tool(scenario, station, record.seam).p_TW - tool.p_TW for record in records] or [np.zeros(3)]
+    more = np.array(of)[np.minimum(weld_numbers(named["phase"]), len(of) - 1)]
     R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
     deflection = series["deflection"][:3, keep].T
     return WeldLog(
@@ -203,7 +207,8 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
         p_BRobot=p_BRobot,
         R_BT=R_BT,
-        p_BTorch=np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
+        p_BTorch=(np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW)
+        + np.einsum("nij,nj->ni", R_BT, more),
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"][0, keep]),
         arc=np.vstack([series.get("arc", missing), series.get("arc_values", missing.repeat(2, axis=0))])[:, keep].T,
@@ -365,10 +370,15 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
     )
 
 
+def weld_numbers(phase: Array) -> NDArray[np.int_]:
+    """The number (N,) of the weld of each row: one begins where the tip is brought into touch again."""
+    touching = phase == PHASE_CODES[Phase.TOUCH]
+    return np.asarray(np.cumsum(touching & ~np.concatenate([[True], touching[:-1]])))
+
+
 def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
-    """Masks (N,) of the log's rows, one for each seam: a weld begins where the tip is brought into touch again."""
-    touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
-    number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
+    """Masks (N,) of the log's rows, one for each weld."""
+    number = weld_numbers(log.telemetry["phase"])
     return [number == k for k in range(int(number[-1]) + 1)]
 
 
