@@ -18,9 +18,9 @@ from weldcal.systems.runner import Run
 from weldcal.tools.report.files import mappings_csv, write_json
 from weldcal.tools.report.pictures import GREY, OURS, TORCH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams
+from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, ordered_angles
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
-from weldcal.welding.record.process import speed_along, torch_angles
+from weldcal.welding.record.process import speed_along
 from weldcal.welding.record.progress import Progress
 from weldcal.welding.record.weld_log import WeldRecord, load_weld_log
 from weldcal.welding.record.welded_seam import (
@@ -149,6 +149,12 @@ class PartRecord:
             if mean == limit == "–":  # neither known nor ordered
                 continue
             found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+        orders = self.log.settings.get("angles") or []
+        order = (orders[seam.seam - 1] if seam.weld_pass == 1 and seam.seam <= len(orders) else None) or {}
+        for name, value in seam.angles.items():
+            wanted = "–" if order.get(name) is None else " to ".join(f"{v:g}" for v in np.ravel(order[name]))
+            between = f"{fixed(value.least, 1)} to {fixed(value.most, 1)}"
+            found.append((f"{name[:-4].replace('_', ' ')}, deg", between, fixed(value.mean, 1), wanted, ""))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -189,6 +195,7 @@ class PartRecord:
             "outside_limits": self.outside,
             "process": asdict(self.log.process),
             "schedule": self.log.settings.get("schedule"),
+            "angles": self.log.settings.get("angles"),
             "stretches": list(self.stretches),
             "seams": [
                 asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
@@ -244,11 +251,9 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     speed = travel_speed = speed_along(log.time, p_BW)
     if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
         travel_speed = speed_along(log.time, np.outer(log.telemetry["s_torch"], [1.0, 0.0, 0.0]))
-    up = np.full((len(log.time), 3), np.nan)
-    if weld.planned is not None:
-        up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
     moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
-    work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
+    unknown = np.full(len(log.time), np.nan)
+    work, travel = (unknown if angle is None else angle for angle in (log.work, log.travel))
     named = log.telemetry
     table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
     table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
@@ -289,6 +294,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "plans": [(plan.seam, plan.weld_pass) for plan in cell.job.planned_seam(run.root).records],
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
+        "angles": ordered_angles(run),
         "schedule": None if cell.scenario.welding.schedule is None else asdict(cell.scenario.welding.schedule),
     }
     phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)

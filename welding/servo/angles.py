@@ -48,8 +48,10 @@ class AnglesAlong:
     def at(self, config: ServoConfig, s_tip: float, s_torch: float) -> ServoConfig:
         """The settings with tip and torch at these arc lengths, m."""
         axial, lateral = (float(np.interp(s_tip, self.s_tip, v)) for v in (self.axial_m, self.lateral_m))
-        rows = (self.clearance_m, self.side_m, self.roll_rad)
-        clearance, side, roll = (float(np.interp(s_torch, self.s_torch, v)) for v in rows)
+        rows = (self.clearance_m, self.side_m)
+        clearance, side = (float(np.interp(s_torch, self.s_torch, v)) for v in rows)
+        # the roll's feedback lags by its time constant
+        roll = float(np.interp(s_torch + config.weld_speed_m_s / config.torch.k_roll, self.s_torch, self.roll_rad))
         return changed(
             config,
             deflection=changed(config.deflection, axial_d_m=axial, delta_d_m=lateral),
