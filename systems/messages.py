@@ -18,9 +18,9 @@ from weldcal.calibration.published.algorithm1 import Algorithm1State, Verificati
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.welding.locate.part.joint import FitUp
+from weldcal.welding.passes.angles import AnglesAlong
 from weldcal.welding.record.schedule import GapAlong
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.angles import AnglesAlong
 
 
 class Message:

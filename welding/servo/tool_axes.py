@@ -11,11 +11,11 @@ from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.seat import JointSection, press_for, seat
 from weldcal.welding.numerics import Array, clip, cross, dot, norm, pose, unit
+from weldcal.welding.passes.angles import angles_along, held
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.clearance import check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, check_feasible
-from weldcal.welding.servo.angles import angles_along, held
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, DeflectionControl, ServoConfig, ToolGeometry
 
 TRAVEL_MARGIN_RAD = math.radians(3.0)  # the weld stops 5 deg beyond the window: 2 deg are left for the plan's error

@@ -23,13 +23,13 @@ from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, tor
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.passes.angles import AnglesAlong, angles_along, lifted
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.restart import Restart
-from weldcal.welding.servo.angles import AnglesAlong, angles_along, lifted
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
