@@ -442,6 +442,7 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         q_retract=way.q_retract,
         lean_rad=way.lean_rad,
         along=along,
+        felt_line=None if seam is drawn else drawn,
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -492,8 +493,10 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     try:
         whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
+        plan = _planned(planning, sequence, seam, planning.X_BP_guess)
         return dc.replace(
-            _planned(planning, sequence, seam, planning.X_BP_guess),
+            plan,
+            records=(*planning.earlier, SeamRecord(planning.number, line=plan.seam)),
             touch_arc_m=arc,
             **again,
             rms_m=0.0,
@@ -502,4 +505,4 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
             summary="the pose of the part is from the fixture's drawing; the scan was not used",
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=sequence, reason=str(error))
+        return PlannedSeam(sequence=sequence, reason=str(error), records=planning.earlier)
