@@ -201,10 +201,10 @@ def lifted(plan: SeamCurve, config: ServoConfig) -> tuple[SeamCurve, ServoConfig
     found, order = held(plan, config), config.angles
     assert order is not None
     check_angles(plan, found, config)
-    up, left, roll = -float(found.axial.mean()), float(found.lateral.mean()), float(found.roll.mean())
-    reach = config.tool.torch_offset_m
-    worst = max(float(np.ptp(found.axial)), float(np.ptp(found.lateral))) / reach
-    if max(worst, float(np.ptp(found.roll))) > 2.0 * LEVEL_RAD:
+    on = found.s_torch >= 0.0
+    rows = np.stack([-found.axial[on], found.lateral[on], config.tool.torch_offset_m * found.roll[on]])
+    up, left, roll = rows.mean(axis=1).tolist()
+    if np.ptp(rows, axis=1).max() > 2.0 * LEVEL_RAD * config.tool.torch_offset_m:
         raise InfeasibleSeam(
             "Plan infeasible: a tip that is not used keeps one height, and along this seam the ordered angles need"
             " several. Order one number for each angle, or let the tip feel the seam."
@@ -213,7 +213,8 @@ def lifted(plan: SeamCurve, config: ServoConfig) -> tuple[SeamCurve, ServoConfig
         config.tool, torch_clearance_m=config.clearance_m - up, side_offset_m=config.tool.side_offset_m - left
     )
     given = replace(order, travel_rad=None, rotation_rad=None)  # by the line
-    config = replace(config, angles=given, tool=tool, torch=replace(config.torch, work_angle_rad=roll))
+    torch = replace(config.torch, work_angle_rad=roll / config.tool.torch_offset_m)
+    config = replace(config, angles=given, tool=tool, torch=torch)
     return plan.raised(up, left), config
 
 
@@ -223,7 +224,7 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
     Raises:
         InfeasibleSeam: with the place, and the limits of what can be ordered.
     """
-    order, usual, mm, deg = config.angles, config.deflection, 1e3, math.degrees
+    order, usual, deg = config.angles, config.deflection, math.degrees
     assert order is not None
     steepest = float(np.abs(found.travel).max())
     if steepest > config.windows.travel_rad:
@@ -242,20 +243,7 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
     over = np.maximum(found.axial - high, low - found.axial)
     k = int(np.argmax(over))
     if over[k] > 1e-6:
-        first, last = (held(plan, config, press).travel for press in (high, low))
-        stick = [mm * (order.stick_out_m + by) for by in (found.axial.max() - high, found.axial.min() - low)]
-        ordered = "stick-out" if order.travel_rad is None else "travel angle"
-        does = f"{mm * abs(a := found.axial[k]):.1f} mm {'down' if a > 0.0 else 'up'} at {mm * max(found.s_tip[k], 0.0):.0f} mm"
-        text = (
-            f"Plan infeasible: with the ordered {ordered} the tip would have to give way by {does} of the seam; its joint"
-            f" holds it from {mm * low:.1f} to {mm * high:.1f} mm down."
-            if order.seat is not None
-            else f"Plan infeasible: with the ordered {ordered} the tip, which is not used, would touch the part."
-        )
-        text += f" Order a travel angle from {deg(first.max()):+.1f} to {deg(last.min()):+.1f} deg"
-        if 0.0 < stick[0] <= stick[1]:
-            text += f", or a stick-out from {stick[0]:.1f} to {stick[1]:.1f} mm"
-        raise InfeasibleSeam(f"{text}.")
+        raise InfeasibleSeam(_refusal(plan, found, config, (low, high), k))
     sin, cos = math.sin(order.half_angle_rad), max(math.cos(order.half_angle_rad), 1e-3)
     if order.seat is None:
         most = np.minimum((CLEAR_M - found.axial * sin) / cos, FARTHEST_M)
@@ -270,7 +258,31 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
         arm = config.tool.torch_offset_m
         first, last = (np.degrees(np.arcsin(np.clip((v + found.aside) / arm, -1.0, 1.0))) for v in (least, most))
         raise InfeasibleSeam(
-            f"Plan infeasible: with the ordered angles the tip would lean by {mm * found.lateral[k]:.1f} mm at"
-            f" {mm * max(found.s_tip[k], 0.0):.0f} mm of the seam, and from {mm * least[k]:.1f} to"
-            f" {mm * most[k]:.1f} mm hold it. Order a rotation from {first.max():+.1f} to {last.min():+.1f} deg."
+            f"Plan infeasible: with the ordered angles the tip would lean by {1e3 * found.lateral[k]:.1f} mm at"
+            f" {1e3 * max(found.s_tip[k], 0.0):.0f} mm of the seam, and from {1e3 * least[k]:.1f} to"
+            f" {1e3 * most[k]:.1f} mm hold it. Order a rotation from {first.max():+.1f} to {last.min():+.1f} deg."
         )
+
+
+def _refusal(plan: SeamCurve, found: Held, config: ServoConfig, limits: tuple[float, float], k: int) -> str:
+    """The sentences of a tip that would leave its limits (low, high) m of the press, worst at the place k."""
+    order = config.angles
+    assert order is not None
+    ends = [held(plan, config, press) for press in limits]
+    text = "the tip, which is not used, would touch the part."
+    if order.seat is not None:
+        a = 1e3 * found.axial[k]
+        text = (
+            f"the tip would have to give way {abs(a):.1f} mm {'down' if a > 0.0 else 'up'} at"
+            f" {1e3 * max(found.s_tip[k], 0.0):.0f} mm of the seam. Its joint holds it from {1e3 * limits[0]:.1f} to"
+            f" {1e3 * limits[1]:.1f} mm down."
+        )
+    travel = [math.degrees(ends[1].travel.max()), math.degrees(ends[0].travel.min())]
+    steep = np.cos(found.travel) * math.cos(max(order.work_rad))
+    longer = [(found.axial - found.above + end.above - a) / steep for end, a in zip(ends, limits, strict=True)]
+    stick = [1e3 * (order.stick_out_m + by) for by in (longer[1].max(), longer[0].min())]
+    change = [f"a travel angle from {travel[0]:+.1f} to {travel[1]:+.1f} deg"] if travel[0] <= travel[1] else []
+    change += [f"a stick-out from {stick[0]:.1f} to {stick[1]:.1f} mm"] if 0.0 < stick[0] <= stick[1] else []
+    what = "stick-out" if order.travel_rad is None else "travel angle"
+    advice = f"Order {', or '.join(change)}" if change else "Leave the travel angle out, or weld it as shorter seams"
+    return f"Plan infeasible: with the ordered {what} {text} {advice}."
