@@ -75,5 +75,5 @@ def test_an_order_that_says_nothing_is_refused(more: str, said: str) -> None:
 
 
 def test_a_nozzle_in_the_joint_is_refused_before_anything_moves() -> None:
-    with pytest.raises(InputError, match="the nozzle would touch the joint: order 7.0 or more"):
+    with pytest.raises(InputError, match=r"the nozzle would touch the joint: order 7\.0 or more"):
         build_cell(load_scenario("straight_groove", CELL.format(more="angles: {stick_out_mm: 5}")))
