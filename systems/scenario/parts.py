@@ -24,6 +24,8 @@ from weldcal.systems.scenario.schema import ObstacleConfig, Scenario, SeamConfig
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")
 CORNER_RAD = math.radians(15.0)  # by which the bisector turns at one of a seam's points
 ROUNDED_M = 0.002  # to each side of a corner the drawing is rounded
+# Between two outside corners: on a leg of 8 mm, the end of a sheet, the tip felt six points and then the corner.
+LEAST_LEG_M = 0.02
 
 
 def nominal_arm(scenario: Scenario) -> ArmModel:
@@ -131,12 +133,26 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.file is not None
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
-    first, *others = (
-        dc.replace(leg, feel=seam.feel, listed=k)
-        for k, seam in enumerate(spec.seams)
-        for leg in legs(shape, source(seam), spec.joint)
-    )
-    return Part(shape, first, tuple(others))
+    found = []
+    for k, seam in enumerate(spec.seams):
+        parts = legs(shape, source(seam), spec.joint)
+        if len(parts) > 1 and seam.feel is not False and spec.joint != "butt":
+            _check_legs(shape, seam.edges, parts)
+        found += [dc.replace(leg, feel=seam.feel, listed=k) for leg in parts]
+    return Part(shape, found[0], tuple(found[1:]))
+
+
+def _check_legs(shape: PartShape, edges: list[int], parts: list[DrawnSeam]) -> None:
+    short = [leg for leg in parts if leg.length_m < LEAST_LEG_M]
+    if short:
+        kept = [id for id in edges if shape.edge(id).length_m >= LEAST_LEG_M]
+        without = ", ".join(f"{{edges: [{id}]}}" for id in kept)
+        raise InputError(
+            f"workpiece.seams: between two corners of edges {', '.join(map(str, edges))} the seam is only"
+            f" {1e3 * short[0].length_m:.0f} mm long; the tip needs {1e3 * LEAST_LEG_M:.0f} mm to feel it. "
+            + (f"Leave it out, as in seams: [{without}], or write" if kept else "Write")
+            + " feel: false beside the edges."
+        )
 
 
 def legs(shape: PartShape, source: SeamSource, joint: str) -> list[DrawnSeam]:

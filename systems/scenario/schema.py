@@ -103,7 +103,7 @@ class AnglesOrder:
         return None if value is None else (math.radians(ends[0]), math.radians(ends[-1]))
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class SeamConfig:
     """A seam on a part from a file: a polyline or edges."""
 

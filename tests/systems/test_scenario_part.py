@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import extrude
@@ -145,6 +146,18 @@ def test_a_square_tube_is_welded_leg_by_leg(tmp_path: Path) -> None:
         up = numbered(part, k).up_P
         assert (up @ up[len(up) // 2]).min() > 0.999
         assert up[0, 2] == pytest.approx(np.sqrt(0.5), abs=0.02)
+
+
+def test_the_end_of_a_sheet_is_too_short_a_leg_and_the_advice_is_taken(tmp_path: Path) -> None:
+    write_step(assembly(box((-90, -90, -10), (180, 180, 10)), box((-50, -4, 0), (100, 8, 40))), tmp_path / "web.step")
+    (joint,) = read_shape(tmp_path / "web.step").joints
+    spec = WorkpieceConfig(file=str(tmp_path / "web.step"), seams=[SeamConfig(edges=list(joint.edges))], joint="fillet")
+    with pytest.raises(InputError, match="only 8 mm long") as refused:
+        part_of(spec)
+    advice = yaml.safe_load(str(refused.value).partition("seams: ")[2].rpartition("seams: ")[2].partition(", or")[0])
+    assert seam_count(part_of(replace(spec, seams=[SeamConfig(**seam) for seam in advice]))) == 2
+    unfelt = [SeamConfig(edges=list(joint.edges), feel=False)]
+    assert seam_count(part_of(replace(spec, seams=unfelt))) == 4
 
 
 def test_a_part_lies_off_by_its_middle_and_not_by_the_origin_of_its_file(cell: Path, tmp_path: Path) -> None:

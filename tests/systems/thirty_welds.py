@@ -145,6 +145,7 @@ def main() -> None:
                 pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
             print(line(row), flush=True)
             print(json.dumps(row), file=table, flush=True)
+    pool.shutdown()
 
 
 if __name__ == "__main__":

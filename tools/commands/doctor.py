@@ -23,6 +23,7 @@ from weldcal.models.result_files import require_whole
 from weldcal.systems.cell import Cell
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, FlangeOption, Outcome, command
+from weldcal.tools.commands.cell.tool import MEASURED_TOOL
 from weldcal.tools.commands.dataset_case import dataset_case
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
@@ -72,6 +73,11 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("recording", _both(_recorded(folder / RECORDING, progress), of_weld))
     if (folder / CSV_NAME).is_file():
         return worded("weld log", Diagnosis(of_weld, 0, float("nan")))
+    if (folder / MEASURED_TOOL).is_file():
+        said = json.loads((folder / MEASURED_TOOL).read_text(encoding="utf-8"))
+        words = f"{said['reason']} {said['cause']}"
+        bent = (Cause("torch bent or moved", 0.95, _SURE, {}, (), words),) if said["cause"] else ()
+        return worded("measurement of the tool", Diagnosis(bent, said["nozzle"]["scans"], float("nan")))
     if of_weld:  # held before anything was seen
         return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():

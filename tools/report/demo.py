@@ -1,5 +1,6 @@
 """The result of a weld job, the JSON object of `demo` and `weld`, and its report."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -240,7 +241,9 @@ class DemoResult:
         if self.weld is not None and self.weld.error is not None:
             seams = [seam_document(error) for error in self.weld.seams]
             found["torch_mean_mm"] = 1e3 * float(self.weld.error.distance_m.mean())
-            found |= {key: float(np.nanmax([seam[key] for seam in seams])) for key in seams[0] if "max" in key}
+            for key in seams[0]:
+                if "max" in key:  # a short seam has no middle
+                    found[key] = max((seam[key] for seam in seams if not math.isnan(seam[key])), default=math.nan)
             if passes := self.run.cell.scenario.welding.later_passes():
                 found["passes"] = pass_documents(self.weld, passes, seams)
             elif len(seams) > 1:

@@ -14,7 +14,8 @@ CHECKED = (
     "scans and poses shifted by one", "robot in another installation", "wrong flange size", "unit mix",
     "poses too alike",
     "scanner out of focus or range", "warm-up drift", "slack flange or loose mount", "wrong kinematics file",
-    "outlier scans or partial views", "hidden tag", "soft tip worn", "scanner axes mirrored",
+    "outlier scans or partial views", "hidden tag", "soft tip worn", "torch bent or moved",
+    "scanner axes mirrored",
     "scans and poses in different orders", "scanner scale error", "too few scans", "position columns exchanged",
 )  # fmt: skip
 
@@ -321,6 +322,10 @@ def _worn(c: Cause) -> tuple[str, str]:
     )
 
 
+def _bent(c: Cause) -> tuple[str, str]:
+    return c.words, "After a repair measure the tool again: weldcal tool check TOOL --measure SCANS."
+
+
 def _held(c: Cause) -> tuple[str, str]:
     return c.words, "Do what the sentence says. docs/robot_faults.md lists the faults of robot and devices."
 
@@ -376,7 +381,7 @@ _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
     "wrong flange size": _flange, "unit mix": _units, "poses too alike": _alike,
     "scanner out of focus or range": _focus,
     "warm-up drift": _drift, "slack flange or loose mount": _slack, "wrong kinematics file": _kinematics,
-    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn,
+    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn, "torch bent or moved": _bent,
     "the run was held": _held,
     "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
     "too few scans": _few, "unexplained": _unexplained, "position columns exchanged": _misread,

@@ -72,7 +72,6 @@ class Held(NamedTuple):
     rest: Array
     R_BT: Array
     travel: Array
-    rotation: Array
     roll: Array
     axial: Array
     lateral: Array
@@ -146,11 +145,19 @@ def held(plan: SeamCurve, config: ServoConfig, travel_axial_m: float | None = No
             travel = np.clip(travel + (axial - wanted) / reach, -0.7, 0.7)
         if order.seat is not None and k % 4 == 1:
             aside, above = _seats(order.seat, order, Press(usual.axial_d_m, usual.delta_d_m), axial, lateral, roll)
-    root = foot - wire  # the turn about the wire is counted from the seam itself
-    left = np.cross(axis, root)
-    rotation = np.arctan2(np.sum(e * left, axis=1), np.sum(y * left, axis=1))
     R = np.stack([math.cos(tilt) * e - math.sin(tilt) * axis, y, math.sin(tilt) * e + math.cos(tilt) * axis], axis=2)
-    return Held(s_torch, s_tip, rest, R, travel, rotation, roll, axial, lateral, aside, above)
+    return Held(
+        s_torch=s_torch,
+        s_tip=s_tip,
+        rest=rest,
+        R_BT=R,
+        travel=travel,
+        roll=roll,
+        axial=axial,
+        lateral=lateral,
+        aside=aside,
+        above=above,
+    )
 
 
 def _seats(

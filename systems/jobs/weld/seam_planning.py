@@ -37,6 +37,7 @@ from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
 Views = tuple[ScanView, ...]
+PassPlan = tuple[SeamCurve, ArmWay, AnglesAlong | None]
 
 
 def plan_root_anyhow(
@@ -159,13 +160,10 @@ class SeamPlanning(Welder):
             WeldcalError: the seam is too short or not feasible, or the tool has no room beside the part at X_BP.
         """
         check_length(seam, self.config)
-        leans = None
         order, tool = self.config.angles, self.tool
-        if order is not None:
-            leans = [self.config.torch.work_angle_rad]
-        elif X_BP is not None:
-            leans = leans_with_clearance(self, seam, X_BP)
+        leans = None if order is None else [self.config.torch.work_angle_rad]
         if X_BP is not None:
+            leans = leans or leans_with_clearance(self, seam, X_BP)
             for lean in () if order is None else order.work_rad:
                 check_clearance(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
@@ -173,9 +171,7 @@ class SeamPlanning(Welder):
         check_travel(seam, self.config)
         return find_way(self, seam, X_BP, leans)
 
-    def pass_way(
-        self, felt: SeamCurve, number: int, X_BP: RigidTransform | None
-    ) -> tuple[SeamCurve, ArmWay, AnglesAlong | None]:
+    def pass_way(self, felt: SeamCurve, number: int, X_BP: RigidTransform | None) -> PassPlan:
         """Plan a pass after the root by its number, from 1, beside the felt line of the tip.
 
         Raises:
@@ -216,10 +212,7 @@ def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: Wel
     return dc.replace(
         plan,
         seam=seam,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
+        **way.reached,
         along=along,
         records=(*root.records, dc.replace(record, line=seam)),
         touch_arc_m=None,
@@ -437,12 +430,10 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         sequence=sequence,
         seam=seam,
         X_BP=X_BP,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
+        **way.reached,
         along=along,
         felt_line=None if seam is drawn else drawn,
+        records=(*planning.earlier, SeamRecord(planning.number, line=seam)),
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -493,10 +484,8 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     try:
         whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
-        plan = _planned(planning, sequence, seam, planning.X_BP_guess)
         return dc.replace(
-            plan,
-            records=(*planning.earlier, SeamRecord(planning.number, line=plan.seam)),
+            _planned(planning, sequence, seam, planning.X_BP_guess),
             touch_arc_m=arc,
             **again,
             rms_m=0.0,

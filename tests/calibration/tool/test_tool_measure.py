@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,9 @@ from weldcal.calibration.tool.comparison import EXCEEDED, HOLDS, judge_tool, mea
 from weldcal.calibration.tool.measure import ToolMeasurement, measure_tool
 from weldcal.calibration.tool.wire import WireTouch, find_wire
 from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.tools.commands.cell.tool import MEASURED_TOOL, MeasureReport
+from weldcal.tools.commands.doctor import examine
+from weldcal.tools.report.files import write_json
 
 TOOLS = 6
 UP = np.array([0.0, 0.0, 1.0])
@@ -94,6 +98,13 @@ def test_a_bent_torch_is_named_and_its_tolerance_is_gone() -> None:
     verdict = judge_tool(found(2.0), 5e-4)
     assert verdict.tolerance == EXCEEDED
     assert verdict.cause.startswith("The torch is bent")
+
+
+@pytest.mark.parametrize(("bend_mm", "named"), [(0.0, []), (2.0, ["torch bent or moved"])])
+def test_the_doctor_knows_a_bent_torch(bend_mm: float, named: list[str], tmp_path: Path) -> None:
+    report = MeasureReport(found(bend_mm), judge_tool(found(bend_mm), 5e-4), 0.5, tmp_path)
+    write_json(tmp_path / MEASURED_TOOL, report.summary())
+    assert [cause.name for cause in examine(tmp_path).causes] == named
 
 
 def test_a_longer_wire_is_no_bent_torch() -> None:

@@ -249,6 +249,8 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
             return unfinished, reason
         if note:
             note = f"{note} As a whole: {refusals[seams[0].edges[0]]}"
+        # The part is planned on the branch of home, and will not lie exactly as drawn.
+        scenario.welding.posture = "any"
     _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
     unfinished.unlink(missing_ok=True)
     return path, note

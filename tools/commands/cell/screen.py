@@ -17,6 +17,7 @@ from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
 from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+from weldcal.systems.scenario.parts import LEAST_LEG_M
 from weldcal.systems.scenario.schema import SeamConfig
 from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
@@ -30,7 +31,6 @@ MOST_TRIED = 4  # seams for which a place is looked for, and after these so many
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
-SHORT_M = 0.02  # the end of a sheet is such an edge: too short for the tip to come down and for the torch to follow
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
@@ -196,10 +196,10 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
         found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}"))
         return found
     by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
-    within = [id for id in ids if shape.edge(id).length_m > SHORT_M and not _below(shape.edge(id))]
+    within = [id for id in ids if shape.edge(id).length_m > LEAST_LEG_M and not _below(shape.edge(id))]
     if 1 < len(within) < len(ids):
         left_out = ", ".join(str(id) for id in ids if id not in within)
-        without = f"Without edges {left_out}, which are shorter than {1e3 * SHORT_M:.0f} mm or open downwards."
+        without = f"Without edges {left_out}, which are shorter than {1e3 * LEAST_LEG_M:.0f} mm or open downwards."
         found.append(([SeamConfig(edges=[id]) for id in within], without))
     return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {named}.") for id in by_length]
 

@@ -30,6 +30,8 @@ from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 
+MEASURED_TOOL = "tool_measurement.json"
+
 TouchesOption = Annotated[
     Path | None, option("--touches", "FILE", "Flange poses at which the wire's end touched one point or a plate.")
 ]
@@ -243,7 +245,7 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
         picture=picture,
     )
     write_atomic(folder / "report.html", page)
-    write_json(folder / "tool_measurement.json", report.summary())
+    write_json(folder / MEASURED_TOOL, report.summary())
     return report
 
 
