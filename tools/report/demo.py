@@ -445,7 +445,6 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     log, named = weld.log, weld.log.telemetry
     keep = named["phase"] != list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
     speed = speed_along(log.time, log.p_BTorch)
-    work, travel = (None if angle is None else angle[keep] for angle in (log.work, log.travel))
     errors = [
         None if e is None else (broken(e.s, np.flatnonzero(np.diff(e.s) < 0.0) + 1), e.lateral, e.height)
         for e in (weld.plan_error, weld.error)
@@ -472,8 +471,8 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
         axial_d=config.deflection.axial_d_m,
         omega_max=config.limits.omega_max_rad_s,
         e_t=named["e_t"][keep],
-        work=work,
-        travel=travel,
+        work=log.work[keep],
+        travel=log.travel[keep],
         windows=(config.windows.work_rad, config.windows.travel_rad),
         axes=(1, 0),
         names=("y, mm", "x, mm"),

@@ -73,12 +73,13 @@ class WeldLog:
     p_BTip: Array  # tip position measured by the servo from the arm's pose and the tag
     p_BRobot: Array  # origin of T: the "robot end effector" of the paper
     R_BT: Array  # (N, 3, 3)
-    p_BTorch: Array
+    p_BW: Array  # wire point, from the measured joints
+    p_BTorch: Array  # the true one in a simulation
+    work: Array  # (N,) angles of the wire against the seam, rad
+    travel: Array
     deflection_T: Array
     sigma_min: Array
     arc: Array | None = None  # (N, 3) arc reported 1 or 0, current A, voltage V of the power source; NaN where none
-    work: Array | None = None  # (N,) angles of the wire against the seam, rad; None: no plan is known
-    travel: Array | None = None
     scheduled: Array | None = None  # (N, 5) as SET_VALUES of the schedule, then the gap m; NaN where none
 
 
@@ -197,13 +198,15 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
     p_BRobot = columns(named, "p_BT")
     q = columns(named, "q_BT", "wxyz")
-    # the wire's end with the stick-out that was ordered for the seam, against that of the tool
     plan = cell.job.planned_seam(root)
     lines = [(record.seam, record.line) for record in plan.records] or [(0, plan.seam)]
-    of = [seam_tool(cell.scenario, cell.station, seam).p_TW - tool.p_TW for seam, _ in lines]
-    number = np.minimum(weld_numbers(named["phase"]), len(of) - 1)
+    number = np.minimum(weld_numbers(named["phase"]), len(lines) - 1)
+    wires = np.array([seam_tool(cell.scenario, cell.station, seam).p_TW for seam, _ in lines])[number]
     R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
     deflection = series["deflection"][:3, keep].T
+    p_BW = p_BRobot + np.einsum("nij,nj->ni", R_BT, wires)
+    if "torch" in series:  # of the tool's own stick-out
+        true = series["torch"][:, keep].T + np.einsum("nij,nj->ni", R_BT, wires - tool.p_TW)
     angles = np.full((2, len(number)), np.nan)
     for k, (_, line) in enumerate(lines):
         if line is not None and (rows := number == k).any():
@@ -217,8 +220,8 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
         p_BRobot=p_BRobot,
         R_BT=R_BT,
-        p_BTorch=(np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW)
-        + np.einsum("nij,nj->ni", R_BT, np.array(of)[number]),
+        p_BW=p_BW,
+        p_BTorch=true if "torch" in series else p_BW,
         work=angles[0],
         travel=angles[1],
         deflection_T=np.array(deflection),

@@ -247,20 +247,17 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     """The weld record from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
-    p_BW = log.p_BRobot + log.R_BT @ config.p_TW
-    speed = travel_speed = speed_along(log.time, p_BW)
+    speed = travel_speed = speed_along(log.time, log.p_BW)
     if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
         travel_speed = speed_along(log.time, np.outer(log.telemetry["s_torch"], [1.0, 0.0, 0.0]))
     moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
-    unknown = np.full(len(log.time), np.nan)
-    work, travel = (unknown if angle is None else angle for angle in (log.work, log.travel))
     named = log.telemetry
     table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
     table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
     table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
     table |= {f"q_B{frame}_{axis}": named[f"q_BT_{axis}"] for frame in "TW" for axis in "wxyz"}
     tip, target = columns(named, "tip"), columns(named, "target")
-    vectors = {"p_BW": p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
+    vectors = {"p_BW": log.p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
     table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
     arc = np.full((len(log.time), 3), np.nan) if log.arc is None else log.arc
     table |= {name: arc[:, k] for k, name in enumerate(("arc", "current_A", "voltage_V"))}
@@ -273,8 +270,8 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "torch_speed_commanded_m_s": named["torch_speed"],
         "tip_speed_m_s": named["tip_speed"],
         "omega_rad_s": named["omega"],
-        "work_angle_rad": np.where(moving, work, np.nan),
-        "travel_angle_rad": np.where(moving, travel, np.nan),
+        "work_angle_rad": np.where(moving, log.work, np.nan),
+        "travel_angle_rad": np.where(moving, log.travel, np.nan),
         "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan), known[:, 0], known[:, 1]),
     }
     settings = {

@@ -14,18 +14,17 @@ import numpy as np
 
 from weldcal.models.workpieces.seat import LEAST_LEAN_M, Press, Seated
 from weldcal.welding.numerics import Array, changed
+from weldcal.welding.passes.felt import CLEAR_M, FARTHEST_M
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.servo.settings import Ends, ServoConfig, TorchAngles
 
 PRESSED_M = (1.0e-3, 5.0e-3)  # a choice: over twice what is lost as contact, and 1.5 mm below the mechanical limit
-FARTHEST_M = 25e-3  # a choice: of a tip that is not used, as of a pass
-CLEAR_M = 1.5e-3  # a choice: between a tip that is not used and the walls, the height of spatter
 CLIMBS = 0.9  # of the sideways force that lifts the ball out of its joint, as in press_for
 LEVEL_RAD = math.radians(0.5)  # a choice, half of the tolerance: by which a seam may turn a tip that is not used
 _PLACES = 9  # of a seam at which the loaded ball's seat is computed
-_ROUNDS = 12  # each leaves an error about a twentieth as large
+_ROUNDS = 12  # after which tip and press are within 1 um
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,8 +47,7 @@ class AnglesAlong:
     def at(self, config: ServoConfig, s_tip: float, s_torch: float) -> ServoConfig:
         """The settings with tip and torch at these arc lengths, m."""
         axial, lateral = (float(np.interp(s_tip, self.s_tip, v)) for v in (self.axial_m, self.lateral_m))
-        rows = (self.clearance_m, self.side_m)
-        clearance, side = (float(np.interp(s_torch, self.s_torch, v)) for v in rows)
+        clearance, side = (float(np.interp(s_torch, self.s_torch, v)) for v in (self.clearance_m, self.side_m))
         # the roll's feedback lags by its time constant
         roll = float(np.interp(s_torch + config.weld_speed_m_s / config.torch.k_roll, self.s_torch, self.roll_rad))
         return changed(
@@ -63,8 +61,8 @@ class AnglesAlong:
 class Held(NamedTuple):
     """A tool at ordered angles along a seam, one row a place.
 
-    Arcs m of torch and tip, rest points (n, 3) and axes (n, 3, 3) of T in B, angles (n,) rad, deflections (n,) m, and
-    the ball's seat beside the bisector and above that of the usual press (n,) m.
+    Arcs (n,) m of torch and tip, rest points (n, 3) m and orientations (n, 3, 3) of T in B, angles (n,) rad, deflections
+    (n,) m. The ball's seat (n,) m is beside the bisector, and above that of the usual press.
     """
 
     s_torch: Array
@@ -280,7 +278,7 @@ def _refusal(plan: SeamCurve, found: Held, config: ServoConfig, limits: tuple[fl
     if order.seat is not None:
         a = 1e3 * found.axial[k]
         text = (
-            f"the tip would have to give way {abs(a):.1f} mm {'down' if a > 0.0 else 'up'} at"
+            f"the tip would have to yield {abs(a):.1f} mm {'down' if a > 0.0 else 'up'} at"
             f" {1e3 * max(found.s_tip[k], 0.0):.0f} mm of the seam. Its joint holds it from {1e3 * limits[0]:.1f} to"
             f" {1e3 * limits[1]:.1f} mm down."
         )

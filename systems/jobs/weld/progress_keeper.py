@@ -14,6 +14,7 @@ import numpy as np
 from weldcal.models.arrays import Array
 from weldcal.models.result_files import write_apart
 from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import seam_tool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.runner import Run
@@ -99,7 +100,8 @@ class ProgressKeeper:
         if math.isnan(self._from_m):
             self._from_m = s
         if lit and s > self._to_m:
-            p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
+            p_TW = seam_tool(run.cell.scenario, run.cell.station, run.command.seam).p_TW
+            p_BCrater = np.asarray(report.X_BT @ p_TW)
             self._to_m = s
             self._progress = replace(self._progress, p_BCrater=p_BCrater)
         late = run.seconds - self._time > EVERY_S and s > self._at
