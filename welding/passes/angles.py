@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.models.workpieces.seat import LEAST_LEAN_M, Press, Seated
 from weldcal.welding.numerics import Array, changed
@@ -61,7 +62,7 @@ class AnglesAlong:
 class Held(NamedTuple):
     """A tool at ordered angles along a seam, one row a place.
 
-    Arcs (n,) m of torch and tip, rest points (n, 3) m and orientations (n, 3, 3) of T in B, angles (n,) rad, deflections
+    Arcs (n,) m of torch and tip, rest points (n, 3) m and R_BT (n, 3, 3), angles (n,) rad, deflections
     (n,) m. The ball's seat (n,) m is beside the bisector, and above that of the usual press.
     """
 
@@ -186,9 +187,10 @@ def angles_along(plan: SeamCurve, config: ServoConfig) -> AnglesAlong:
     torch = np.maximum.accumulate(found.s_torch)
     tip = np.maximum.accumulate(found.s_tip)
     above, aside = (np.interp(found.s_torch, tip, v) for v in (found.above, found.aside))  # as the tip was there
+    runs_up = (found.s_torch < 0.0) & (order.seat is not None)  # without an arc the angles may differ
     return AnglesAlong(
         s_tip=tip,
-        axial_m=found.axial,
+        axial_m=np.where(runs_up, np.clip(found.axial, *PRESSED_M), found.axial),
         lateral_m=found.lateral,
         s_torch=torch,
         clearance_m=config.clearance_m - above,
@@ -206,8 +208,8 @@ def lifted(plan: SeamCurve, config: ServoConfig) -> tuple[SeamCurve, ServoConfig
     found, order = held(plan, config), config.angles
     assert order is not None
     check_angles(plan, found, config)
-    on = found.s_torch >= 0.0
-    rows = np.stack([-found.axial[on], found.lateral[on], config.tool.torch_offset_m * found.roll[on]])
+    found = Held._make(v[_welding(plan, found)] for v in found)
+    rows = np.stack([-found.axial, found.lateral, config.tool.torch_offset_m * found.roll])
     up, left, roll = rows.mean(axis=1).tolist()
     if np.ptp(rows, axis=1).max() > 2.0 * LEVEL_RAD * config.tool.torch_offset_m:
         raise InfeasibleSeam(
@@ -223,6 +225,11 @@ def lifted(plan: SeamCurve, config: ServoConfig) -> tuple[SeamCurve, ServoConfig
     return plan.raised(up, left), config
 
 
+def _welding(plan: SeamCurve, found: Held) -> NDArray[np.bool_]:
+    """The rows (n,) with the torch on the seam and the tip in its joint: before and after, the tip may be anywhere."""
+    return np.asarray((found.s_torch >= 0.0) & (found.s_tip <= plan.drawn_m))
+
+
 def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
     """Check that the tip stays in its joint, or clear of it, and the travel angle in its window.
 
@@ -231,6 +238,8 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
     """
     order, usual, deg = config.angles, config.deflection, math.degrees
     assert order is not None
+    rows = _welding(plan, found)
+    found = Held._make(v[rows] for v in found)
     steepest = float(np.abs(found.travel).max())
     if steepest > config.windows.travel_rad:
         raise InfeasibleSeam(
@@ -248,7 +257,8 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
     over = np.maximum(found.axial - high, low - found.axial)
     k = int(np.argmax(over))
     if over[k] > 1e-6:
-        raise InfeasibleSeam(_refusal(plan, found, config, (low, high), k))
+        ends = [Held._make(v[rows] for v in held(plan, config, press)) for press in (low, high)]
+        raise InfeasibleSeam(_refusal(found, ends, config, (low, high), k))
     sin, cos = math.sin(order.half_angle_rad), max(math.cos(order.half_angle_rad), 1e-3)
     if order.seat is None:
         most = np.minimum((CLEAR_M - found.axial * sin) / cos, FARTHEST_M)
@@ -269,11 +279,13 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
         )
 
 
-def _refusal(plan: SeamCurve, found: Held, config: ServoConfig, limits: tuple[float, float], k: int) -> str:
-    """The sentences of a tip that would leave its limits (low, high) m of the press, worst at the place k."""
+def _refusal(found: Held, ends: list[Held], config: ServoConfig, limits: tuple[float, float], k: int) -> str:
+    """The sentences of a tip that would leave its limits (low, high) m of the press, worst at the place k.
+
+    ends: the tool as it is held by the least and the largest press.
+    """
     order = config.angles
     assert order is not None
-    ends = [held(plan, config, press) for press in limits]
     text = "the tip, which is not used, would touch the part."
     if order.seat is not None:
         a = 1e3 * found.axial[k]

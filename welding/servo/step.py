@@ -309,7 +309,7 @@ def _weld(
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
         state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not cut_short else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
-        state = changed(state, hold=off)
+        state = changed(state, hold=off - _press(config))
 
     state = _slewed(state, *_servo(state, off, sample, config), config, dt)
     p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
@@ -392,7 +392,7 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
-    wanted, rise = state.hold, 0.0
+    wanted, rise = state.hold + _press(config), 0.0
     if state.phase == Phase.COAST:
         # after a tack the plan may have come off by more than over a gap: the tip comes down deeper
         height = -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m
@@ -403,6 +403,11 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         wanted = state.residual_at_loss + np.array((0.0, height))
     gap = wanted - off
     return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1]) + rise
+
+
+def _press(config: ServoConfig) -> Array:
+    """The wanted place (2,) m of the tip's rest point beside and above its seat."""
+    return np.array((config.deflection.delta_d_m, -config.deflection.axial_d_m))
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
