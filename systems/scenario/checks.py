@@ -243,6 +243,29 @@ def check_refinement(scenario: Scenario) -> None:
         )
 
 
+def check_order(scenario: Scenario) -> None:
+    """Check the order of the weld, and that what its limits are compared with will be known.
+
+    Raises:
+        InputError: an invalid value, or a limit of something that nothing measures or states.
+    """
+    welding = scenario.welding
+    process, limits, schedule = welding.process.process(), welding.order.limits, welding.schedule
+    welding.order.check()
+    stated = {process.current_A is not None} | {bool(schedule and schedule.current_A and schedule.voltage_V)}
+    for name in ("heat_input_kJ_mm", "current_A", "voltage_V"):
+        if getattr(limits, name) is not None and isinstance(scenario.power_source, NoDevice) and True not in stated:
+            raise InputError(
+                f"welding.order.limits.{name} needs the arc's current and voltage: write power_source, or"
+                " current_A and voltage_V under welding.process as they are set by hand."
+            )
+    if limits.heat_input_kJ_mm is not None and process.k is None:
+        raise InputError(
+            "welding.order.limits.heat_input_kJ_mm needs the process: write welding.process.name, such as MAG, or"
+            " welding.process.efficiency."
+        )
+
+
 def check_schedule(scenario: Scenario) -> None:
     """Check the welding schedule.
 
@@ -338,8 +361,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError(
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
-    scenario.welding.process.process()
-    scenario.welding.order.check()
+    check_order(scenario)
     scenario.welding.arc.check(scenario.reports_arc)
     check_schedule(scenario)
     weave = scenario.welding.weave

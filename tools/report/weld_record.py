@@ -1,5 +1,6 @@
 """Write the record of a welded part: record.html, record.json, record.csv, pictures, and the report's section."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -124,8 +125,7 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {_name(seam)}: {_WORDS[name][0]} is {_range(seam, name)} {_WORDS[name][1]}, and the limit is"
-            f" {_limit(self.order, name)}."
+            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name)}, and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -136,7 +136,7 @@ class PartRecord:
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
-        return [(_name(seam), *row) for seam in self.seams for row in self.rows_of(seam)]
+        return [(seam.name, *row) for seam in self.seams for row in self.rows_of(seam)]
 
     def rows_of(self, seam: WeldedSeam) -> list[tuple[str, ...]]:
         """The same rows of one seam, without its number."""
@@ -216,15 +216,16 @@ class PartRecord:
 
     def page(self, written: str) -> str:
         """The record as one self-contained HTML text."""
-        ended, seams = str(self.log.settings.get("ended", "")), len(self.seams)
-        limited, what = self.order.limits != OrderLimits(), f"{seams} seam{'' if seams == 1 else 's'} welded"
+        ended, seams = str(self.log.settings.get("ended", "")), len({seam.seam for seam in self.seams})
+        passes = f" in {len(self.seams)} passes" if len(self.seams) > seams else ""
+        limited, what = self.order.limits != OrderLimits(), f"{seams} seam{'' if seams == 1 else 's'} welded{passes}"
         tone, headline = ("good", f"{what}, within all limits") if limited else ("plain", f"{what}, no limits ordered")
         if self.outside:
             tone, headline = "bad", f"{what}, {len(self.outside)} of the limits exceeded"
         if ended not in ("", "done") or not seams:
             tone, headline = "bad", f"{what}; the job was held"
         cards = [
-            (f"Seam {_name(seam)}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
+            (f"Seam {seam.name}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
             for seam in self.seams
             for words in [f"{seam.welded_mm:.0f} mm in {seam.arc_s:.1f} s; arc values {_SOURCES[seam.arc_values]}"]
         ]
@@ -286,6 +287,8 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
         "law": config.law,
+        "start_s": cell.scenario.welding.arc.start_s,
+        "crater_s": cell.scenario.welding.arc.crater_s,
         "woven": bool(config.weave.amplitude_m),
         "felt": felt_seams(run),
         "plans": [(plan.seam, plan.weld_pass) for plan in cell.job.planned_seam(run.root).records],
@@ -358,12 +361,13 @@ def stretch_rows(progress: Progress) -> list[dict[str, object]]:
     ]
 
 
-def _name(seam: WeldedSeam) -> str:
-    return str(seam.seam) if seam.weld_pass == 1 else f"{seam.seam}, pass {seam.weld_pass}"
-
-
 def _spread(seam: WeldedSeam, name: str) -> Spread:
     return seam.figures[name] if name in RANGES else seam.path_mm
+
+
+def _known(seam: WeldedSeam, name: str) -> str:
+    known = math.isfinite(_spread(seam, name).mean)
+    return f"{_range(seam, name)} {_WORDS[name][1]}" if known else "not known"
 
 
 def _range(seam: WeldedSeam, name: str) -> str:

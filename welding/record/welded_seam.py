@@ -14,6 +14,7 @@ from weldcal.welding.record.weld_log import WeldRecord
 STRETCH_M = 0.010  # a choice: two to three times the length of the pool, over which heat and speed act together
 LEAST_ROWS = 3  # a choice: two intervals of the servo; a shorter arc has no speed
 GAP_S = 0.1  # a choice: rows of one weld are 8 ms apart; a longer gap is a hold, whose time is no time of welding
+_AT_REST = 0.1  # of the usual step: slower at its ends, the torch waits for the arc or fills the crater
 _ROUNDING = 1e-9  # of the sums; far below the digits of any limit
 ANGLES = ("work_angle_deg", "travel_angle_deg")
 MEASURED, SET, UNKNOWN = "measured", "set", "unknown"
@@ -35,7 +36,8 @@ class WeldedSeam:
     Attributes:
         seam, weld_pass: their numbers, from 1; welded_mm, arc_s: length and time of the arc.
         arc_values: measured (by the power source), set (as ordered of it), or unknown.
-        figures: by the names of RANGES, over stretches of 10 mm; their means over the seam.
+        figures: by the names of RANGES, over stretches of 10 mm; their means over the seam. The speed is
+            without the ordered times of standing, welding.arc.start_s and crater_s.
         path_mm: distance of the torch from the felt seam: mean and largest.
         angles: of the wire against the seam, deg.
         arc_mm: where along the planned seam the arc burned, (from, to) of each stretch.
@@ -50,6 +52,11 @@ class WeldedSeam:
     path_mm: Spread
     angles: dict[str, Spread] = field(default_factory=dict)
     arc_mm: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The number of the seam, with that of a pass after the root."""
+        return str(self.seam) if self.weld_pass == 1 else f"{self.seam}, pass {self.weld_pass}"
 
     def outside(self, limits: OrderLimits) -> tuple[str, ...]:
         """Names of the limits that the seam exceeds, or that nothing is known of."""
@@ -96,9 +103,10 @@ def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -
     current, voltage, source = arc_values(record, on)
     heat = (record.process.k or math.nan) * voltage[:-1] * current[:-1] * dt  # J, EN 1011-1 and ISO/TR 18491
     stretch = np.minimum(np.cumsum(length) // STRETCH_M, max(length.sum() // STRETCH_M - 1.0, 0.0)).astype(int)
+    stands = (record.settings.get("start_s", 0.0), record.settings.get("crater_s", 0.0))
     tables = {
         "heat_input_kJ_mm": (1e-6 * heat, length),
-        "speed_mm_s": (1e3 * length, dt),
+        "speed_mm_s": (1e3 * length, np.where(_stands(length, dt, burned, *stands), 0.0, dt)),
         "current_A": (current[:-1] * dt, dt),
         "voltage_V": (voltage[:-1] * dt, dt),
     }
@@ -120,6 +128,19 @@ def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -
         },
         arc_mm=tuple((float(np.nanmin(s)), float(np.nanmax(s))) for s in burned if np.isfinite(s).any()),
     )
+
+
+def _stands(length: Array, dt: Array, burns: Sequence[Array], start_s: float, crater_s: float) -> NDArray[np.bool_]:
+    """The steps (N,) for which the torch stands as ordered, at the start of a burn and at its end."""
+    still = length < _AT_REST * np.median(length[length > 0.0]) if length.any() else length < 0.0
+    found, k = np.zeros(len(length), dtype=bool), 0
+    for burn in burns:
+        rows = slice(k, k + len(burn) - 1)
+        for turn, ordered_s in ((1, start_s), (-1, crater_s)):
+            begun = np.logical_and.accumulate(still[rows][::turn]) & (np.cumsum(dt[rows][::turn]) <= ordered_s)
+            found[rows] |= begun[::turn]
+        k += len(burn)
+    return found
 
 
 def arc_values(record: WeldRecord, rows: NDArray[np.intp]) -> tuple[Array, Array, str]:

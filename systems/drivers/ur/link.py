@@ -239,13 +239,16 @@ class UrLink:
         """Return the fault of a worker that gives no state: after a lost connection ur_rtde may crash, or connect again
         inside a call for as long as it takes."""
         if ended:
-            return Fault.LINK_CLOSED if "disconnected" in self._said() else Fault.WORKER_DIED
+            return Fault.LINK_CLOSED if "reconnecting" in self._output().lower() else Fault.WORKER_DIED
         calling = self._memory.calling.read()
         return Fault.LINK_STALE if calling is not None and calling.inside else Fault.WORKER_DIED
 
-    def _said(self) -> str:
+    def _output(self) -> str:
         self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return self._errors.read().decode(errors="replace")
+
+    def _said(self) -> str:
+        lines = self._output().strip().splitlines()
         return lines[-1] if lines else ""
 
     def _end(self) -> None:

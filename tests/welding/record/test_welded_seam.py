@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,15 @@ def test_the_time_before_the_arc_is_no_time_of_welding() -> None:
     assert standing.figures["speed_mm_s"].least == pytest.approx(10.0 / 1.8, rel=0.01)
 
 
+def test_ordered_standing_is_no_travel_and_longer_standing_is() -> None:
+    stands = log([0.0] * 100 + [0.010] * 251 + [0.0] * 50)
+    found = only(replace(stands, settings={"start_s": 0.8, "crater_s": 0.4}))
+    assert (found.arc_s, found.welded_mm) == pytest.approx((3.2, 20.0), rel=0.01)
+    assert found.figures["speed_mm_s"].least == pytest.approx(10.0, rel=0.01)
+    shorter = only(replace(stands, settings={"start_s": 0.3, "crater_s": 0.4}))
+    assert shorter.figures["speed_mm_s"].least == pytest.approx(10.0 / 1.5, rel=0.01)
+
+
 def test_a_hold_is_no_time_of_welding() -> None:
     record = log([0.010] * 251)
     record["time_s"][100:] += 30.0
@@ -149,6 +159,31 @@ def test_each_limit_is_compared_with_the_extremes(limits: dict[str, object], out
 def test_an_order_that_cannot_be_is_refused(order: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", f"welding: {{order: {order}}}")
+
+
+@pytest.mark.parametrize(
+    ("limit", "process", "said"),
+    [
+        ("heat_input_kJ_mm: [0.1, 2]", "", "needs the arc's current and voltage"),
+        ("current_A: [100, 200]", "", "needs the arc's current and voltage"),
+        ("current_A: [100, 200]", "current_A: 150, voltage_V: 20, efficiency: 0.8", ""),
+        ("heat_input_kJ_mm: [0.1, 2]", "name: MAG, current_A: 150, voltage_V: 20", ""),
+    ],
+)
+def test_a_limit_of_what_nobody_knows_is_refused_before_the_weld(limit: str, process: str, said: str) -> None:
+    keys = f"welding: {{order: {{limits: {{{limit}}}}}, process: {{{process}}}}}"
+    if said:
+        with pytest.raises(InputError, match=said):
+            load_scenario("s_groove", keys)
+    else:
+        assert load_scenario("s_groove", keys).welding.order.limits != OrderLimits()
+
+
+def test_heat_by_a_power_source_needs_the_process() -> None:
+    order = "{power_source: !SimulatedPowerSource {}, welding: {order: {limits: {heat_input_kJ_mm: [0.1, 2]}}PROCESS}}"
+    with pytest.raises(InputError, match=r"write welding\.process\.name"):
+        load_scenario("s_groove", order.replace("PROCESS", ""))
+    assert load_scenario("s_groove", order.replace("PROCESS", ", process: {name: MAG}")).welding.process.name == "MAG"
 
 
 def test_a_line_break_in_an_order_is_refused() -> None:

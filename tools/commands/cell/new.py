@@ -159,6 +159,9 @@ def new(
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)
         note = {"note": reason} if reason else {}
+        spec = load_scenario(str(written)).workpiece
+        if part is not None and spec is not None:
+            note = {"seams": "; ".join("edges " + ", ".join(map(str, seam.edges)) for seam in spec.seams)} | note
     values = {"written": str(written), **note, "next": following}
     return Outcome({"state": "done", **values}, values=values)
 

@@ -13,6 +13,7 @@ from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces.part import seam_count
 from weldcal.systems.drivers.config import DriverConfig, NoDevice
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
@@ -22,7 +23,8 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.emulators.cell.wires import Arc
 from weldcal.tools.report.weld import true_seam
-from weldcal.welding.record.process import path_error
+from weldcal.welding.record.process import PathError, path_error
+from weldcal.welding.seam.curve import SeamCurve
 
 SETTLES = 0.05  # share by which the joints move to the offset of a new stop in a step
 STEP_S = 0.002
@@ -138,7 +140,9 @@ class Physics:
         self._frame = 0
         self.time_s = 0.0
         self.arc_on_s = 0.0
-        self.torch: list[Array] = []  # (3,) m in B, at the servo's rate, while the arc burns
+        self.burns: list[list[Array]] = []  # of each burn of the arc, (3,) m of the torch in B at the servo's rate
+        self._burns = False
+        self.passes = scenario.welding.later_passes()
         self.collisions = 0
         self._touches = False
 
@@ -151,8 +155,11 @@ class Physics:
             self._advance(np.concatenate([true_q, qd]))
         if arc.burns:
             self.arc_on_s += STEP_S
+            if not self._burns:
+                self.burns.append([])
             if self._frame % LOG_EVERY == 0 and self._torch_port is not None:
-                self.torch.append(np.array(self._torch_port.Eval(self._context)))
+                self.burns[-1].append(np.array(self._torch_port.Eval(self._context)))
+        self._burns = arc.burns
         if self._frame % COLLISION_EVERY == 0:
             frames = link_frames(self._arm, true_q)
             touches = (
@@ -185,7 +192,7 @@ class Physics:
     def forget(self) -> None:
         """Begin the record of another job."""
         self.arc_on_s, self.collisions = 0.0, 0
-        self.torch.clear()
+        self.burns.clear()
 
     def positions(self) -> Array:
         """Return all positions of the plant, as the scanner's process poses its copy of it."""
@@ -210,6 +217,35 @@ def _tag_on(world: SimulatedWorld, tool: WeldingTool) -> tuple[int, int, RigidTr
     return plate, tip, tool.X_FT.InvertAndCompose(tool.X_FM_rest)
 
 
+def _seams(physics: Physics) -> list[SeamCurve]:
+    """The torch's true paths along the seams of the part."""
+    truth = physics.station.truth
+    assert truth.workpiece is not None
+    found = [true_seam(truth, k) for k in range(seam_count(truth.workpiece))]
+    return [seam for seam in found if seam is not None]
+
+
+def _of_burns(physics: Physics) -> list[tuple[tuple[int, int], PathError]]:
+    """Of each burn its seam and pass, from 0, and the torch's error: it is of the nearest seam, whose n-th is pass n.
+
+    Where the world orders no passes every burn is of the root.
+    """
+    seams, found = _seams(physics), list[tuple[tuple[int, int], PathError]]()
+    for points in physics.burns:
+        if len(points) < FEWEST:
+            continue
+        p = np.array(points)
+        off = [float(np.median(path_error(p[:: len(p) // FEWEST], seam).distance_m)) for seam in seams]
+        k = int(np.argmin(off))
+        number = min(sum(numbers[0] == k for numbers, _ in found), len(physics.passes))
+        line, reverse = seams[k], False
+        if number:
+            order = physics.passes[number - 1]
+            line, reverse = line.raised(order.vertical_m, order.lateral_m), order.reverse
+        found.append(((k, number), path_error(p, line, backwards=reverse)))
+    return found
+
+
 def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest: bool) -> dict[str, object]:
     """The contents of the truth file. `wanted_m` is the arc length to weld; None: the whole seam.
 
@@ -223,23 +259,31 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
     if truth.profiler is not None:
         found["X_FS"] = truth.profiler.X_FS.GetAsMatrix4().tolist()
         found["p_FTip"], found["sphere_center"] = truth.profiler.p_FTip.tolist(), truth.profiler.center.tolist()
-    seam = true_seam(truth)
-    if seam is None:  # a world without a workpiece
+    if truth.workpiece is None:
         return found | {"collisions": physics.collisions, "time_s": physics.time_s}
-    welded_m = 0.0
-    if len(physics.torch) >= FEWEST:
-        error = path_error(np.array(physics.torch), seam)
-        distance = 1e3 * np.hypot(error.lateral, error.height)
-        welded_m = float(error.s.max() - error.s.min())
+    welded_m, errors = 0.0, _of_burns(physics)
+    if errors:
+        distance = 1e3 * np.concatenate([error.distance_m for _, error in errors])
+        lateral = 1e3 * np.abs(np.concatenate([error.lateral for _, error in errors]))
+        root = [(seam, error.s) for (seam, number), error in errors if number == 0]
+        for seam in {seam for seam, _ in root}:
+            welded_m += float(np.ptp(np.concatenate([s for other, s in root if other == seam])))
         found |= {
             "torch_mean_mm": float(distance.mean()),
             "torch_max_mm": float(distance.max()),
-            "torch_lateral_mean_mm": 1e3 * error.mean_m,
-            "torch_lateral_max_mm": 1e3 * error.max_m,
+            "torch_lateral_mean_mm": float(lateral.mean()),
+            "torch_lateral_max_mm": float(lateral.max()),
         }
+        if len({numbers for numbers, _ in errors}) > 1:
+            found["burns"] = [
+                {"seam": seam + 1, "pass": number + 1, "torch_max_mm": 1e3 * float(error.distance_m.max())}
+                for (seam, number), error in errors
+            ]
     else:
         found |= {"torch_mean_mm": None, "torch_max_mm": None}
-    whole = welded_m >= WELDED * (seam.length if wanted_m is None else wanted_m)
+    seams = _seams(physics)
+    wanted_m = sum(seam.length for seam in seams) if wanted_m is None else wanted_m * len(seams)
+    whole = welded_m >= WELDED * wanted_m
     state = "waiting"
     if physics.arc_on_s:
         good = whole and physics.collisions == 0

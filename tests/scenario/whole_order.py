@@ -1,0 +1,113 @@
+"""A whole order by wire with one command: three seams, root and cap, tacks, schedule, a measured torch, and the record.
+
+python -m tests.scenario.whole_order FOLDER [--seed N]
+plays the devices with `weldcal emulate-cell`, runs `weldcal weld`, and prints what the world knows of torch and part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import yaml
+
+from tests.calibration.tool.torches import Wrong, cell
+from weldcal.calibration.tool.comparison import measured_file, tool_text
+from weldcal.calibration.tool.measure import measure_tool
+from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.models.workpieces.reading import read_shape
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER
+from weldcal.tools.emulators.cell.process import CELL, PLAYED_HOST, PLAYED_SCANS, WORLD, X_BC, played_world
+from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
+
+BENT_M, TILTED_RAD = 1.5e-3, 0.01  # of the torch against the shipped tool file
+POWER_PORT = 5021
+CAP = {"lateral_mm": 2.0, "vertical_mm": 3.0, "reverse": True, "interpass_s": 5.0}
+TACKS = [{"from_mm": 20.0, "to_mm": 32.0, "height_mm": 4.5, "seam": 2}]
+
+
+def tools(folder: Path, seed: int) -> None:
+    """Write true.yaml, the bent torch, and measured.yaml, what scans and touches find of it."""
+    bent = cell(seed, Wrong(bend=BENT_M, tilt=TILTED_RAD))
+    found = measure_tool(load_tool(WELDING), bent.scans, bent.covariance, bent.touches)
+    true: Any = SimpleNamespace(tool=found.tool, p_FW=bent.truth.p_FW, axis=bent.truth.axis, move=lambda _: None)
+    (folder / "measured.yaml").write_text(tool_text(found, measured_file(found), "scans"), encoding="utf-8")
+    (folder / "true.yaml").write_text(yaml.safe_dump(measured_file(true)), encoding="utf-8")
+
+
+def part(folder: Path) -> list[dict[str, list[int]]]:
+    """Write a block on a plate, two solids; its three seams that the arm reaches."""
+    write_step(assembly(box((-90, -70, -15), (180, 140, 15)), box((-40, -30, 0), (80, 60, 40))), folder / "part.step")
+    shape = read_shape(folder / "part.step")
+    (joint,) = shape.joints
+    return [{"edges": [id]} for id in joint.edges[:3]]
+
+
+def texts(folder: Path) -> tuple[str, str]:
+    """The scenario of the world, and that of the cell."""
+    pose = {"xyz_m": [0.65, 0.0, 0.015], "rpy_deg": [0.0, 0.0, 90.0]}
+    piece: dict[str, Any] = {"file": str(folder / "part.step"), "seams": part(folder), "joint": "fillet"}
+    piece |= {"pose_guess": pose}
+    world = WORLD.split("workpiece:")[0] + "home_deg:" + WORLD.split("home_deg:")[1]
+    off = {"placement_error": {"translation_mm": 3.0, "rotation_deg": 0.5}}
+    keys: dict[str, Any] = {"workpiece": piece | off, "tool": {"file": str(folder / "true.yaml")}}
+    keys |= {"welding": {"tacks": TACKS, "passes": [CAP]}}
+    world += yaml.safe_dump(keys)
+    wires = (SCENARIO_FOLDER / f"{CELL}.yaml").read_text(encoding="utf-8")
+    home = "home_deg:" + wires.split("home_deg:")[1]
+    wires = wires.split("workpiece:")[0].replace("pace: 0.5", "pace: 1.0") + home
+    wires = wires.replace("  arc_input: 0\n  arc_fault_input: 1\n", "")
+    order = {"order": "4711", "wps": "WPS-135-07 rev. B", "part": "block on plate", "serial": "1", "operator": "ak"}
+    order |= {"limits": {"heat_input_kJ_mm": [0.1, 2.0], "speed_mm_s": [7.0, 9.0], "path_mm": 0.5}}
+    welding = {
+        "order": order,
+        "process": {"name": "MAG"},
+        "passes": [CAP],
+        "tacks": TACKS,
+        "arc": {"start": "rest", "start_s": 0.2, "crater_s": 0.4},
+        "schedule": {
+            "job": 3,
+            "wire_feed_m_min": 6.0,
+            "voltage_V": 20.0,
+            "hot_start": {"wire_feed_m_min": 7.0, "voltage_V": 21.0, "time_s": 0.3, "ramp_s": 0.2},
+            "crater": {"wire_feed_m_min": 3.0, "voltage_V": 17.0, "ramp_s": 0.3},
+        },
+    }
+    cell_keys = {
+        "workpiece": piece,
+        "tool": {"file": str(folder / "measured.yaml")},
+        "welding": welding,
+        "job": {"calibrate": False, "X_BC": yaml.safe_load(X_BC), "X_BC_sigma_mm": 0.1, "maximum_time_s": 900.0},
+    }
+    wires += yaml.safe_dump(cell_keys)
+    return world, wires + f"power_source: !ModbusPowerSource {{host: {PLAYED_HOST}, port: {POWER_PORT}}}\n"
+
+
+def main() -> None:
+    """Play the world, run the command, print its answer and the truth."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    words = parser.parse_args()
+    folder = words.folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    tools(folder, words.seed)
+    world, wires = texts(folder)
+    wires = wires.replace(PLAYED_SCANS, str(folder / "scans"))
+    order = folder / "cell.yaml"
+    order.write_text(wires, encoding="utf-8")
+    with played_world(folder, world, wires, words.seed) as played:
+        command = [sys.executable, "-m", "weldcal.tools", "weld", str(order), "--out", str(folder / "out")]
+        print("weldcal", *command[3:], flush=True)
+        answer = subprocess.run([*command, "--overwrite"], check=False)
+        print("exit code", answer.returncode)
+        print(json.dumps(played.truth(), indent=1))
+
+
+if __name__ == "__main__":
+    main()
