@@ -1,4 +1,4 @@
-"""Holds the wire at ordered angles: how the tip gives way, and how the tool turns, along a planned seam.
+"""Holds the wire at ordered angles: how the tip yields, and how the tool turns, along a planned seam.
 
 Torch and tip are fixed to each other and both follow the seam, so that only a roll about the line between them is free.
 A travel angle or a rotation about the wire moves the tip's rest point, up and down or aside. Its springs allow that as
