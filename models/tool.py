@@ -1,6 +1,6 @@
 """The touch-based welding tool (paper, Fig. 7): plate with flange ring, finger camera, soft tip with tag, torch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -100,6 +100,8 @@ class WeldingTool:
     chord_m: float = 0.060  # |d| of Eq. 14
     torch_height_m: float = -0.0015  # z of the wire point in T
     torch_tilt_rad: float = 0.0  # how far the wire's axis leans back from the tip's, away from it
+    stick_out_m: float | None = 0.012  # from the nozzle's end to the wire point, as drawn; None: not known
+    nozzle_radius_m: float = 0.009
     mass_kg: float = 1.4
     centre_of_mass_m: tuple[float, float, float] = (0.03, 0.0, 0.05)
     ring: FlangeStandard | None = RING  # what the scanner measures; None: the arm's bare flange
@@ -167,6 +169,24 @@ class WeldingTool:
     def p_TW(self) -> Array:
         """Wire point of the torch in the tip frame (3,), m."""
         return np.array([-self.chord_m, 0.0, self.torch_height_m])
+
+    def with_stick_out(self, stick_out_m: float) -> "WeldingTool":
+        """The same tool with another length of wire out of its nozzle.
+
+        Raises:
+            InputError: its own stick-out is not known, or the torch would come too near to the tip.
+        """
+        if self.stick_out_m is None:
+            raise InputError("A stick-out is ordered, and the tool file has none: write torch.stick_out_mm there.")
+        more, tilt = stick_out_m - self.stick_out_m, self.torch_tilt_rad
+        return replace(
+            self,
+            chord_m=self.chord_m - more * np.sin(tilt),
+            torch_height_m=self.torch_height_m - more * np.cos(tilt),
+            stick_out_m=stick_out_m,
+            shapes=self.drawn(),
+            keep_clear=tuple(self.capsules()),
+        )
 
     @property
     def X_FR(self) -> RigidTransform:

@@ -18,6 +18,7 @@ from weldcal.calibration.published.algorithm1 import Algorithm1State, Verificati
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.welding.locate.part.joint import FitUp
+from weldcal.welding.passes.angles import AnglesAlong
 from weldcal.welding.record.schedule import GapAlong
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -237,6 +238,7 @@ class SeamRecord(Message):
     fit_up: FitUp | None = None
     left_out: tuple[tuple[float, float], ...] = ()
     weld_pass: int = 0  # 0: the root
+    line: SeamCurve | None = None  # of the tip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -279,6 +281,7 @@ class PlannedSeam(Message):
     # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
     lean_rad: float = 0.0
     gap: GapAlong | None = None  # along this plan, where the welding schedule follows it
+    along: AnglesAlong | None = None  # how the tool is led along it where angles of the wire are ordered
 
     @property
     def key(self) -> tuple[int, int, int]:

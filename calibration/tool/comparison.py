@@ -93,6 +93,8 @@ def measured_file(found: ToolMeasurement) -> dict[str, Any]:
         "xyz_mm": _mm(p_new),
         "axis": [round(float(v), _DIGITS + 2) for v in a_new],
     }
+    if not np.isnan(found.stick_out_m):
+        document["torch"]["stick_out_mm"] = round(1e3 * found.stick_out_m, _DIGITS)
     for shape in document.get("shapes") or []:
         if shape.get("mesh"):
             shape["mesh"] = str((path.parent / shape["mesh"]).resolve())

@@ -58,6 +58,8 @@ class TorchPart:
 
     xyz_mm: Triple = (0.0, 0.0, 0.0)  # the wire point, where the arc burns
     axis: Triple = (0.0, 0.0, 1.0)  # direction of the wire, towards the work
+    stick_out_mm: float | None = None  # from the nozzle's end to the wire point
+    nozzle_mm: float = 18.0  # outer diameter of the nozzle
 
 
 @dataclass
@@ -218,6 +220,8 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         chord_m=chord,
         torch_height_m=height,
         torch_tilt_rad=_tilt(R_FT, part.torch.axis),
+        stick_out_m=None if part.torch.stick_out_mm is None else part.torch.stick_out_mm / 1e3,
+        nozzle_radius_m=0.5 * part.torch.nozzle_mm / 1e3,
         mass_kg=part.mass_kg,
         centre_of_mass_m=_metres(part.centre_of_gravity_mm),
         ring=None if part.ring is None else _ring(path.name, part.ring),

@@ -40,6 +40,7 @@ class DrawnSeam:
     gap_m: float = 0.0
     closed: bool = False
     feel: bool | None = None
+    listed: int = 0  # its number among the scenario's seams, of which one may have several legs
 
     def __post_init__(self) -> None:
         n = len(self.points_P)

@@ -330,6 +330,27 @@ def check_seam_order(scenario: Scenario) -> None:
         )
 
 
+def check_angles_order(scenario: Scenario) -> None:
+    """Check the ordered angles of the wire.
+
+    Raises:
+        InputError: a list that is not of two angles, a stick-out of no length, or another key that turns the tool.
+    """
+    welding, spec = scenario.welding, scenario.workpiece
+    orders = [welding.angles] + ([] if spec is None else [seam.angles for seam in spec.seams])
+    for order in orders:
+        if order is None:
+            continue
+        for name in ("work_angle_deg", "travel_angle_deg", "wire_rotation_deg"):
+            order.ends_rad(name)
+        if order.stick_out_mm is not None:
+            check_range("angles.stick_out_mm", order.stick_out_mm, 3.0, 40.0)  # a choice: of any arc with a wire
+        if welding.law != "guarded" or welding.lean_deg:
+            raise InputError(
+                "Ordered angles go with welding.law: guarded and welding.lean_deg: 0; leave out the other."
+            )
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -366,6 +387,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
     check_tack_order(scenario)
     check_seam_order(scenario)
+    check_angles_order(scenario)
     if scenario.welding.stitch is not None:
         scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
     scenario.planning.planning_method()

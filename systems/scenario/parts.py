@@ -134,11 +134,11 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
     found = []
-    for seam in spec.seams:
+    for k, seam in enumerate(spec.seams):
         parts = legs(shape, source(seam), spec.joint)
         if len(parts) > 1 and seam.feel is not False and spec.joint != "butt":
             _check_legs(shape, seam.edges, parts)
-        found += [dc.replace(leg, feel=seam.feel) for leg in parts]
+        found += [dc.replace(leg, feel=seam.feel, listed=k) for leg in parts]
     return Part(shape, found[0], tuple(found[1:]))
 
 

@@ -82,7 +82,28 @@ class CalibrationConfig:
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
+class AnglesOrder:
+    """Angles of the wire against the seam, as one number or as those at its start and end, and the stick-out."""
+
+    # lean across the seam from the joint's bisector, the tool's left side up
+    work_angle_deg: list[float] | float | int = 0.0
+    # lean along the seam: push is positive, drag is negative; null: as the usual press of the tip gives it
+    travel_angle_deg: list[float] | float | int | None = None
+    # of the tool about the wire, the tip to the left; null: as the usual press of the tip gives it
+    wire_rotation_deg: list[float] | float | int | None = None
+    stick_out_mm: float | None = None  # from the nozzle's end to the wire point; null: that of the tool file
+
+    def ends_rad(self, name: str) -> tuple[float, float] | None:
+        """An angle at the seam's start and end, rad; raises InputError for a list that is not of two."""
+        value = getattr(self, name)
+        ends = value if isinstance(value, list) else [value]
+        if len(ends) not in (1, 2):
+            raise InputError(f"angles.{name} must hold one number or two, not {len(ends)}.")
+        return None if value is None else (math.radians(ends[0]), math.radians(ends[-1]))
+
+
+@dc.dataclass(kw_only=True)
 class SeamConfig:
     """A seam on a part from a file: a polyline or edges."""
 
@@ -94,6 +115,7 @@ class SeamConfig:
     end_mm: float = 0.0  # cut off at the end
     # true: the tip feels it; false: it is followed from the scan and the drawing; null: felt where a ball can feel it
     feel: bool | None = None
+    angles: AnglesOrder | None = None  # null: welding.angles
 
 
 @dc.dataclass(kw_only=True)
@@ -197,6 +219,7 @@ class PassOrder:
     lateral_mm: float = 0.0  # to the left of the root's travel, square to the joint's bisector
     vertical_mm: float = 0.0  # along the bisector, out of the joint
     angle_deg: float = 0.0  # lean of the tool across the seam, the left side up
+    travel_angle_deg: float | None = None  # push is positive, drag is negative; null: as the lifted tip gives it
     speed_mm_s: float | None = None  # null: welding.speed_mm_s
     reverse: bool = False  # weld it from the seam's end to its start
     interpass_s: float = 0.0  # least time since the arc of the pass before went out
@@ -207,6 +230,7 @@ class PassOrder:
             lateral_m=1e-3 * self.lateral_mm,
             vertical_m=1e-3 * self.vertical_mm,
             angle_rad=math.radians(self.angle_deg),
+            travel_rad=None if self.travel_angle_deg is None else math.radians(self.travel_angle_deg),
             speed_m_s=None if self.speed_mm_s is None else 1e-3 * self.speed_mm_s,
             reverse=self.reverse,
             interpass_s=self.interpass_s,
@@ -280,6 +304,7 @@ class WeldingConfig:
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
     schedule: WeldSchedule | None = None  # null: no set values; the power source is set by hand
     order: WeldOrder = dc.field(default_factory=WeldOrder)
+    angles: AnglesOrder | None = None  # of the wire; null: as tip and torch give them on the joint's bisector
     weave: WeaveOrder | None = None  # null: a stringer bead
     stitch: StitchOrder | None = None  # null: the arc burns along the whole seam
     tacks: list[TackOrder] = dc.field(default_factory=list)  # a simulated part has them

@@ -212,7 +212,8 @@ workpiece:
   units: mm
   joint: fillet
   seams:
-    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0, feel: false}
+    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0, feel: false,
+       angles: {work_angle_deg: 1.0, travel_angle_deg: [-2.0, -1.0], wire_rotation_deg: 1.5, stick_out_mm: 13.0}}
   length_mm: 250.0
   pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
@@ -247,10 +248,12 @@ welding:
   order: {order: o, wps: w, wpqr: q, drawing: d, part: p, serial: s, batch: b, operator: x, material: m, filler: f,
     filler_batch: fb, gas: g, position: PA, note: n, limits: {heat_input_kJ_mm: [0.5, 1.0], speed_mm_s: [7.0, 9.0],
     current_A: [80.0, 100.0], voltage_V: [10.0, 12.0], path_mm: 0.4}}
+  angles: {work_angle_deg: [1.0, 2.0], travel_angle_deg: -1.5, wire_rotation_deg: 2.0, stick_out_mm: 14.0}
   weave: {shape: crescent, amplitude_mm: 1.5, frequency_hz: 1.5, dwell_s: [0.1, 0.2], bow_mm: 0.5, plane_deg: 10.0}
   stitch: {on_mm: 20.0, off_mm: 40.0, from_mm: 5.0, order: middle_out}
   tacks: [{from_mm: 50.0, to_mm: 60.0, height_mm: 5.0, seam: 2}]
-  passes: [{lateral_mm: 1.0, vertical_mm: 3.0, angle_deg: 5.0, speed_mm_s: 9.0, reverse: true, interpass_s: 30.0}]
+  passes: [{lateral_mm: 1.0, vertical_mm: 3.0, angle_deg: 5.0, travel_angle_deg: 6.0, speed_mm_s: 9.0,
+            reverse: true, interpass_s: 30.0}]
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4

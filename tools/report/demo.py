@@ -46,7 +46,7 @@ from weldcal.tools.report.weld import (
     weave_document,
 )
 from weldcal.tools.report.weld_record import PartRecord
-from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
+from weldcal.welding.record.process import PathError, path_error, speed_along
 from weldcal.welding.record.weld_log import heat_summary
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -448,10 +448,6 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     log, named = weld.log, weld.log.telemetry
     keep = named["phase"] != list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
     speed = speed_along(log.time, log.p_BTorch)
-    work = travel = None
-    if weld.planned is not None:
-        up = weld.planned.up(named["s_torch"])
-        work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.torch.work_angle_rad))
     errors = [
         None if e is None else (broken(e.s, np.flatnonzero(np.diff(e.s) < 0.0) + 1), e.lateral, e.height)
         for e in (weld.plan_error, weld.error)
@@ -478,8 +474,8 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
         axial_d=config.deflection.axial_d_m,
         omega_max=config.limits.omega_max_rad_s,
         e_t=named["e_t"][keep],
-        work=work,
-        travel=travel,
+        work=log.work[keep],
+        travel=log.travel[keep],
         windows=(config.windows.work_rad, config.windows.travel_rad),
         axes=(1, 0),
         names=("y, mm", "x, mm"),

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import seated_tip, work_point
+from weldcal.systems.jobs.weld.settings import angles_order, seam_tool, seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.messages import SeamRecord
 from weldcal.systems.runner import Run
@@ -26,7 +27,7 @@ from weldcal.systems.station import Truth
 from weldcal.tools.report.files import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
-from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
+from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics, wire_angles
 from weldcal.welding.record.weave import MeasuredWeave, measure_weave
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
@@ -72,7 +73,10 @@ class WeldLog:
     p_BTip: Array  # tip position measured by the servo from the arm's pose and the tag
     p_BRobot: Array  # origin of T: the "robot end effector" of the paper
     R_BT: Array  # (N, 3, 3)
-    p_BTorch: Array
+    p_BW: Array  # wire point, from the measured joints
+    p_BTorch: Array  # the true one in a simulation
+    work: Array  # (N,) angles of the wire against the seam, rad
+    travel: Array
     deflection_T: Array
     sigma_min: Array
     arc: Array | None = None  # (N, 3) arc reported 1 or 0, current A, voltage V of the power source; NaN where none
@@ -194,8 +198,21 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
     p_BRobot = columns(named, "p_BT")
     q = columns(named, "q_BT", "wxyz")
+    plan = cell.job.planned_seam(root)
+    lines = [(record.seam, record.line) for record in plan.records] or [(0, plan.seam)]
+    number = np.minimum(weld_numbers(named["phase"]), len(lines) - 1)
+    wires = np.array([seam_tool(cell.scenario, cell.station, seam).p_TW for seam, _ in lines])[number]
     R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
     deflection = series["deflection"][:3, keep].T
+    p_BW = p_BRobot + np.einsum("nij,nj->ni", R_BT, wires)
+    if "torch" in series:  # of the tool's own stick-out
+        true = series["torch"][:, keep].T + np.einsum("nij,nj->ni", R_BT, wires - tool.p_TW)
+    angles = np.full((2, len(number)), np.nan)
+    for k, (_, line) in enumerate(lines):
+        if line is not None and (rows := number == k).any():
+            s = named["s_torch"][rows]
+            frame = (line.tangent(s), line.normal(s), line.up(s))
+            angles[:, rows] = wire_angles(R_BT[rows], *frame, tool.torch_tilt_rad)
     return WeldLog(
         time=named["tick_time"],
         telemetry=named,
@@ -203,7 +220,10 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
         p_BRobot=p_BRobot,
         R_BT=R_BT,
-        p_BTorch=np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
+        p_BW=p_BW,
+        p_BTorch=true if "torch" in series else p_BW,
+        work=angles[0],
+        travel=angles[1],
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"][0, keep]),
         arc=np.vstack([series.get("arc", missing), series.get("arc_values", missing.repeat(2, axis=0))])[:, keep].T,
@@ -365,10 +385,15 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
     )
 
 
+def weld_numbers(phase: Array) -> NDArray[np.int_]:
+    """The number (N,) of the weld of each row: one begins where the tip is brought into touch again."""
+    touching = phase == PHASE_CODES[Phase.TOUCH]
+    return np.asarray(np.cumsum(touching & ~np.concatenate([[True], touching[:-1]])))
+
+
 def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
-    """Masks (N,) of the log's rows, one for each seam: a weld begins where the tip is brought into touch again."""
-    touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
-    number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
+    """Masks (N,) of the log's rows, one for each weld."""
+    number = weld_numbers(log.telemetry["phase"])
     return [number == k for k in range(int(number[-1]) + 1)]
 
 
@@ -384,6 +409,13 @@ def felt_seams(run: Run[WeldJob]) -> list[bool]:
     """Whether the tip feels each of the seams, in the order of welding."""
     cad, tool = run.cell.station.cad, run.cell.station.tool
     return [] if cad is None or tool is None else [is_felt(numbered(cad, k), tool) for k in range(seam_count(cad))]
+
+
+def ordered_angles(run: Run[WeldJob]) -> list[dict[str, Any] | None]:
+    """What is ordered of the wire's angles on each seam, in the order of welding; None: nothing."""
+    cad, scenario = run.cell.station.cad, run.cell.scenario
+    orders = [] if cad is None else [angles_order(scenario, cad, k) for k in range(seam_count(cad))]
+    return [None if order is None else asdict(order) for order in orders]
 
 
 def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:

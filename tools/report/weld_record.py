@@ -19,9 +19,9 @@ from weldcal.systems.runner import Run
 from weldcal.tools.report.files import mappings_csv, write_json
 from weldcal.tools.report.pictures import GREY, OURS, TORCH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams
+from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, ordered_angles
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
-from weldcal.welding.record.process import speed_along, torch_angles
+from weldcal.welding.record.process import speed_along
 from weldcal.welding.record.progress import Progress
 from weldcal.welding.record.weld_log import WeldRecord, load_weld_log
 from weldcal.welding.record.welded_seam import (
@@ -149,6 +149,12 @@ class PartRecord:
             if mean == limit == "–":  # neither known nor ordered
                 continue
             found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+        orders = self.log.settings.get("angles") or []
+        order = (orders[seam.seam - 1] if seam.weld_pass == 1 and seam.seam <= len(orders) else None) or {}
+        for name, value in seam.angles.items():
+            wanted = "–" if order.get(name) is None else " to ".join(f"{v:g}" for v in np.ravel(order[name]))
+            between = f"{fixed(value.least, 1)} to {fixed(value.most, 1)}"
+            found.append((f"{name[:-4].replace('_', ' ')}, deg", between, fixed(value.mean, 1), wanted, ""))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -189,6 +195,7 @@ class PartRecord:
             "outside_limits": self.outside,
             "process": asdict(self.log.process),
             "schedule": self.log.settings.get("schedule"),
+            "angles": self.log.settings.get("angles"),
             "stretches": list(self.stretches),
             "seams": [
                 asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
@@ -241,22 +248,17 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     """The weld record from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
-    p_BW = log.p_BRobot + log.R_BT @ config.p_TW
-    speed = travel_speed = speed_along(log.time, p_BW)
+    speed = travel_speed = speed_along(log.time, log.p_BW)
     if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
         travel_speed = speed_along(log.time, np.outer(log.telemetry["s_torch"], [1.0, 0.0, 0.0]))
-    up = np.full((len(log.time), 3), np.nan)
-    if weld.planned is not None:
-        up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
     moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
-    work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
     named = log.telemetry
     table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
     table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
     table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
     table |= {f"q_B{frame}_{axis}": named[f"q_BT_{axis}"] for frame in "TW" for axis in "wxyz"}
     tip, target = columns(named, "tip"), columns(named, "target")
-    vectors = {"p_BW": p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
+    vectors = {"p_BW": log.p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
     table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
     arc = np.full((len(log.time), 3), np.nan) if log.arc is None else log.arc
     table |= {name: arc[:, k] for k, name in enumerate(("arc", "current_A", "voltage_V"))}
@@ -269,8 +271,8 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "torch_speed_commanded_m_s": named["torch_speed"],
         "tip_speed_m_s": named["tip_speed"],
         "omega_rad_s": named["omega"],
-        "work_angle_rad": np.where(moving, work, np.nan),
-        "travel_angle_rad": np.where(moving, travel, np.nan),
+        "work_angle_rad": np.where(moving, log.work, np.nan),
+        "travel_angle_rad": np.where(moving, log.travel, np.nan),
         "heat_input_J_m": process.heat_input(np.where(log.torch_on, travel_speed, np.nan), known[:, 0], known[:, 1]),
     }
     settings = {
@@ -292,6 +294,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "plans": [(plan.seam, plan.weld_pass) for plan in cell.job.planned_seam(run.root).records],
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
+        "angles": ordered_angles(run),
         "schedule": None if cell.scenario.welding.schedule is None else asdict(cell.scenario.welding.schedule),
     }
     phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)

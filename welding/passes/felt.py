@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, ServoConfig
+from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, ServoConfig, TorchAngles
 from weldcal.welding.servo.state import WeldingState
 
 CLEAR_M = 1.5e-3  # a choice: between the ball and the weld below it, the height of spatter
@@ -31,6 +31,7 @@ class WeldPass:
     Attributes:
         lateral_m, vertical_m: of its torch's path from that of the root, to the left of the root's travel and along the
             joint's bisector out of it.
+        travel_rad: lean along its own travel, push positive; None: as the lift of the tip gives it.
         angle_rad: lean of the tool across the seam; positive: its left side, in the root's travel, is higher.
         speed_m_s: None: as the root. reverse: it is welded from the end to the start.
         interpass_s: least time since the arc of the pass before went out.
@@ -40,6 +41,7 @@ class WeldPass:
     vertical_m: float = 0.0
     angle_rad: float = 0.0
     speed_m_s: float | None = None
+    travel_rad: float | None = None
     reverse: bool = False
     interpass_s: float = 0.0
 
@@ -124,10 +126,16 @@ def lift_m(root: ServoConfig, ball_m: float) -> float:
 def pass_config(root: ServoConfig, order: WeldPass, ball_m: float) -> ServoConfig:
     """Settings of a pass after the root: the tip is not used, and hangs above the path of the torch."""
     tool = replace(root.tool, torch_clearance_m=root.clearance_m - lift_m(root, ball_m), side_offset_m=0.0)
+    angles = None
+    if order.travel_rad is not None:
+        half_rad = 0.5 * math.pi if root.angles is None else root.angles.half_angle_rad
+        work, travel = order.lean_rad, order.travel_rad
+        angles = TorchAngles(work_rad=(work, work), travel_rad=(travel, travel), half_angle_rad=half_rad)
     return replace(
         root,
         felt=False,
         tacks=(),
+        angles=angles,
         tool=tool,
         touch=replace(root.touch, offset_m=0.0),
         deflection=replace(root.deflection, delta_d_m=_OFF_M, axial_d_m=_OFF_M),

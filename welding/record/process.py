@@ -228,16 +228,17 @@ def speed_along(time: ArrayLike, p_B: ArrayLike, window_s: float = 0.05) -> Arra
     return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / (last - first))
 
 
-def torch_angles(R_BT: ArrayLike, up_B: ArrayLike, work_angle_rad: float = 0.0) -> tuple[Array, Array]:
-    """Work and travel angle (N,), rad: how far the tool leans across and along its chord from the surface's normal.
+def wire_angles(R_BT: Array, t: Array, n: Array, up: Array, tilt_rad: float = 0.0) -> tuple[Array, Array]:
+    """Work and travel angle (N,), rad: how far the wire leans across and along the seam from the joint's bisector.
 
     Args:
-        R_BT: (N,3,3) orientation of T, x_T from torch to tip; up_B: (N,3) unit normals of the surface beside the torch.
-        work_angle_rad: the wanted work angle, which the first answer is measured from.
+        R_BT: (N,3,3) orientation of T, x_T from torch to tip.
+        t, n, up: (N,3) the seam's tangent, left and bisector beside the torch.
+        tilt_rad: how far the wire leans back in T, as of WeldingTool.
 
-    Positive travel: the tip is higher than the torch; positive work: the tool's left is.
+    Positive travel: push, the wire points in the direction of travel; positive work: the tool's left is up. The travel
+    angle is that of AWS A3.0, in the plane of wire and seam.
     """
-    R, up = np.asarray(R_BT, dtype=float), np.asarray(up_B, dtype=float)
-    along = np.clip(np.einsum("ni,ni->n", R[:, :, 0], up), -1.0, 1.0)
-    across = np.clip(np.einsum("ni,ni->n", R[:, :, 1], up), -1.0, 1.0)
-    return np.arcsin(across) - work_angle_rad, np.arcsin(along)
+    axis = R_BT @ np.array([-math.sin(tilt_rad), 0.0, math.cos(tilt_rad)])
+    along, left, high = (np.sum(axis * v, axis=1) for v in (t, n, up))
+    return -np.arctan2(left, high), -np.arcsin(np.clip(along, -1.0, 1.0))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ LEAST_ROWS = 3  # a choice: two intervals of the servo; a shorter arc has no spe
 GAP_S = 0.1  # a choice: rows of one weld are 8 ms apart; a longer gap is a hold, whose time is no time of welding
 _AT_REST = 0.1  # of the usual step: slower at its ends, the torch waits for the arc or fills the crater
 _ROUNDING = 1e-9  # of the sums; far below the digits of any limit
+ANGLES = ("work_angle_deg", "travel_angle_deg")
 MEASURED, SET, UNKNOWN = "measured", "set", "unknown"
 
 
@@ -38,6 +39,7 @@ class WeldedSeam:
         figures: by the names of RANGES, over stretches of 10 mm; their means over the seam. The speed is
             without the ordered times of standing, welding.arc.start_s and crater_s.
         path_mm: distance of the torch from the felt seam: mean and largest.
+        angles: of the wire against the seam, deg.
         arc_mm: where along the planned seam the arc burned, (from, to) of each stretch.
     """
 
@@ -48,6 +50,7 @@ class WeldedSeam:
     arc_values: str
     figures: dict[str, Spread]
     path_mm: Spread
+    angles: dict[str, Spread] = field(default_factory=dict)
     arc_mm: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -109,6 +112,7 @@ def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -
     }
     off = 1e3 * np.hypot(record["e_t_m"][on], record["e_height_m"][on])
     off = off[np.isfinite(off)]
+    angles = {name: np.degrees(record[f"{name[:-3]}rad"][on]) for name in ANGLES}
     return WeldedSeam(
         seam=numbers[0] + 1,
         weld_pass=numbers[1] + 1,
@@ -117,6 +121,11 @@ def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -
         arc_values=source,
         figures={name: _spread(*table, stretch) for name, table in tables.items()},
         path_mm=Spread(*map(float, (off.min(), off.mean(), off.max()))) if len(off) else Spread(),
+        angles={
+            name: Spread(float(np.min(v)), float(np.mean(v)), float(np.max(v)))
+            for name, v in angles.items()
+            if np.isfinite(v).all()
+        },
         arc_mm=tuple((float(np.nanmin(s)), float(np.nanmax(s))) for s in burned if np.isfinite(s).any()),
     )
 

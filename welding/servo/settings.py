@@ -4,6 +4,7 @@ The defaults are those of docs/weld_law.md.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -11,6 +12,7 @@ from numbers import Real
 import numpy as np
 
 from weldcal.models.errors import InputError
+from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.welding.numerics import Array
 from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.passes.tacks import Hop, Tack, check_tacks, hops
@@ -20,6 +22,8 @@ from weldcal.welding.seam.refinement import RefinementConfig
 from weldcal.welding.servo.weave import Bound, WeaveConfig, check_weave, tool_bounds
 
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
+Ends = tuple[float, float]
+"""An angle at the seam's start and at its end, rad; linear between them."""
 
 
 class ServoConfigError(InputError):
@@ -237,6 +241,29 @@ class TorchControl:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TorchAngles:
+    """Ordered angles of the wire against the frame of the seam beside it.
+
+    Attributes:
+        work_rad: lean across the seam from the joint's bisector; positive: the tool's left side is up.
+        travel_rad: lean along it; positive: push, the wire points in the direction of travel. None: as the press gives.
+        rotation_rad: of the tool about the wire, from the line to the seam at the tip; positive: the tip to the left.
+        half_angle_rad: between a wall and the bisector, as the ball feels it.
+        stiffness_ratio: of the tip's springs, axial to lateral.
+        seat: where the tip rests in the joint at a press; None: the tip is not used.
+        stick_out_m: of the wire, for messages; NaN: not known.
+    """
+
+    work_rad: Ends = (0.0, 0.0)
+    travel_rad: Ends | None = None
+    rotation_rad: Ends | None = None
+    half_angle_rad: float = 0.5 * math.pi
+    stiffness_ratio: float = 0.5
+    seat: Callable[[Press], Seated] | None = None
+    stick_out_m: float = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
 class MotionLimits:
     """Bounds on the motion that a law may command.
 
@@ -328,6 +355,7 @@ class ServoConfig:
         period_s: servo tick; lag_s: delay between command and motion of the robot, which the torch's equations look
             ahead by.
         felt: whether the tip is used; else it hangs clear and the torch follows the plan.
+        angles: those that are ordered; None: as tip and torch give them.
     """
 
     tool: ToolGeometry = field(default_factory=ToolGeometry)
@@ -347,6 +375,7 @@ class ServoConfig:
     weave: WeaveConfig = field(default_factory=WeaveConfig)
     stitch: StitchConfig = field(default_factory=StitchConfig)
     tacks: tuple[Tack, ...] = ()
+    angles: TorchAngles | None = None
     weld_speed_m_s: float = 8.0e-3
     period_s: float = 0.008
     lag_s: float = 0.025

@@ -309,7 +309,7 @@ def _weld(
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
         state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not cut_short else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
-        state = changed(state, hold=off)
+        state = changed(state, hold=off - _press(config))
 
     state = _slewed(state, *_servo(state, off, sample, config), config, dt)
     p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
@@ -392,19 +392,23 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
-    wanted, rise = state.hold, np.zeros(2)
+    wanted, rise = state.hold + _press(config), np.zeros(2)
     if state.phase == Phase.COAST:
         # after a tack the plan may have come off by more than over a gap: the tip comes down deeper
         place = np.array((0.0, -_DOWN_SHARE * deflection.axial_d_m if state.settling else -config.gap.hover_m))
         hop = config.hop_at(state.s_tip)
         if hop is not None:
             # released as slowly to the side as it is lifted: the tool turns about the torch for both
-            pressed = np.array((deflection.delta_d_m, -deflection.axial_d_m))
-            place, slope = hop.place(state.s_tip, pressed, place)
+            place, slope = hop.place(state.s_tip, _press(config), place)
             rise = slope * state.v_tip
         wanted = state.residual_at_loss + place
     lateral, upward = deflection.k_follow * (wanted - off) + rise
     return float(lateral), float(upward)
+
+
+def _press(config: ServoConfig) -> Array:
+    """The wanted place (2,) m of the tip's rest point beside and above its seat."""
+    return np.array((config.deflection.delta_d_m, -config.deflection.axial_d_m))
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:

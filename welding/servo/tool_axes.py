@@ -11,6 +11,7 @@ from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.seat import JointSection, press_for, seat
 from weldcal.welding.numerics import Array, clip, cross, dot, norm, pose, unit
+from weldcal.welding.passes.angles import angles_along, held
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.clearance import check_clearance
 from weldcal.welding.seam.curve import SeamCurve
@@ -94,7 +95,8 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     """Compute how the servo moves the tool along a planned seam, from the touch to the torch at the seam's end.
 
     The tip's rest point leads: it is pressed aside and down by the wanted deflections. The torch trails by the chord,
-    at its height. The lean across the chord is the wanted work angle against the surface at the torch.
+    at its height. The lean across the chord is the wanted work angle against the surface at the torch, or the wire has
+    its ordered angles.
 
     Args:
         plan: the planned seam in B.
@@ -114,7 +116,11 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     # in T the chord is (d, 0, -h), and (h, 0, d) is square to it and to y
     e, d, h = np.cross(u, y), tool.torch_offset_m, tool.torch_height_m
     x, z = (d * u + h * e) / math.hypot(d, h), (d * e - h * u) / math.hypot(d, h)
-    poses = [pose(np.column_stack([x[k], y[k], z[k]]), rest[k]) for k in range(len(tip))]
+    R = np.stack([x, y, z], axis=2)
+    if config.angles is not None:
+        found = held(line, config)
+        rest, R = found.rest, found.R_BT
+    poses = [pose(R[k], rest[k]) for k in range(len(tip))]
     steps = np.hypot(np.diff(tip), np.diff(torch))
     speed = np.maximum(np.hypot(chart.tip_speed, chart.torch_speed), 1e-6)
     time = np.concatenate([[0.0], np.cumsum(2.0 * steps / (speed[1:] + speed[:-1]))])
@@ -134,8 +140,11 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
     The pressed tip's rest point is deeper in the joint than the torch.
 
     Raises:
-        InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD.
+        InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD, or see angles_along.
     """
+    if config.angles is not None:
+        angles_along(plan, config)
+        return
     tool, windows = config.tool, config.windows
     line, path = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan, tool_path(plan, config)
     tip, chord = path.s_tip, math.hypot(tool.torch_offset_m, tool.torch_height_m)

@@ -5,7 +5,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -54,6 +54,11 @@ class ArmWay(NamedTuple):
     q_retract: Array
     lean_rad: float
     along: tuple[Followed, ...]
+
+    @property
+    def reached(self) -> dict[str, Any]:
+        """The joints and the lean by their names in a PlannedSeam."""
+        return {name: getattr(self, name) for name in self._fields if name != "along"}
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)

@@ -32,6 +32,7 @@ from weldcal.systems.jobs.weld.settings import (
     job_plan,
     pieces_of,
     plan_poses,
+    seam_tool,
     servo_config,
     travel_of,
     work_point,
@@ -324,9 +325,11 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     # a live calibration states its own
     speeds = () if welding.schedule is None else welding.schedule.speeds_m_s()
     sigma_mm = scenario.calibration.required_error_mm if scenario.job.calibrate else scenario.job.X_BC_sigma_mm
+    tools = [seam_tool(scenario, station, k) for k in range(seam_count(station.cad))]
     return SeamPlanning(
         arm=station.arm,
-        tool=station.tool,
+        tool=tools[0],
+        tools=tuple(tools),
         workpiece=station.cad,
         X_BP_guess=spec.pose_guess.pose(),
         config=replace(config, weld_speed_m_s=max(speeds)) if speeds else config,  # the arm must follow the fastest

@@ -14,6 +14,7 @@ import numpy as np
 from weldcal.models.arrays import Array
 from weldcal.models.result_files import write_apart
 from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import seam_tool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.runner import Run
@@ -97,7 +98,7 @@ class ProgressKeeper:
     ) -> None:
         assert report.X_BT is not None
         assert state.plan_fit is not None
-        p_BCrater = np.asarray(report.X_BT @ run.cell.job.servo_config.p_TW)
+        p_BCrater = np.asarray(report.X_BT @ seam_tool(run.cell.scenario, run.cell.station, run.command.seam).p_TW)
         # while the tool stands for its arc, s_torch is the place where it began to come to rest
         s = planned.begins_m + state.plan_fit.curve.nearest(p_BCrater, state.s_torch)
         if math.isnan(self._from_m):

@@ -23,6 +23,7 @@ from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, tor
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root_anyhow
+from weldcal.welding.passes.angles import AnglesAlong, angles_along, lifted
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
@@ -36,6 +37,7 @@ from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 Views = tuple[ScanView, ...]
+PassPlan = tuple[SeamCurve, ArmWay, AnglesAlong | None]
 
 
 OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
@@ -81,6 +83,7 @@ class SeamPlanning(Welder):
     q_from: Array | None = None  # (6,) rad, above the end of the seam before; None: home
     order_words: str = ""  # of the seams
     configs: tuple[ServoConfig, ...] = ()  # of each seam; else `config` is that of all
+    tools: tuple[WeldingTool, ...] = ()  # likewise
 
     def goes_on(self) -> bool:
         """Whether this seam, or its piece, is the broken one."""
@@ -95,7 +98,8 @@ class SeamPlanning(Welder):
     def of_seam(self, number: int) -> Self:
         """Return what the seam of this number is planned from."""
         config = self.configs[number] if number < len(self.configs) else self.config
-        return dc.replace(self, workpiece=numbered(self.workpiece, number), number=number, config=config)
+        tool = self.tools[number] if number < len(self.tools) else self.tool
+        return dc.replace(self, workpiece=numbered(self.workpiece, number), number=number, config=config, tool=tool)
 
     def without_tacks(self, points_B: Array, seam: SeamCurve) -> Array:
         """The points (n, 3) m of a scan that are not of the ordered tacks; the seam is the tip's line."""
@@ -130,15 +134,18 @@ class SeamPlanning(Welder):
             WeldcalError: the seam is too short or not feasible, or the tool has no room beside the part at X_BP.
         """
         check_length(seam, self.config)
-        leans = None
+        order, tool = self.config.angles, self.tool
+        leans = None if order is None else [self.config.torch.work_angle_rad]
         if X_BP is not None:
-            tool, leans = self.tool, leans_with_clearance(self, seam, X_BP)
+            leans = leans or leans_with_clearance(self, seam, X_BP)
+            for lean in () if order is None else order.work_rad:
+                check_clearance(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s, self.config.windows)
         check_travel(seam, self.config)
         return find_way(self, seam, X_BP, leans)
 
-    def pass_way(self, felt: SeamCurve, number: int, X_BP: RigidTransform | None) -> tuple[SeamCurve, ArmWay]:
+    def pass_way(self, felt: SeamCurve, number: int, X_BP: RigidTransform | None) -> PassPlan:
         """Plan a pass after the root by its number, from 1, beside the felt line of the tip.
 
         Raises:
@@ -150,6 +157,8 @@ class SeamPlanning(Welder):
         seam = pass_line(felt, order, self.config, tool.tip_radius_m, ahead_m, OVERLAP_M)
         check_length(seam, config)
         try:
+            if config.angles is not None:
+                seam, config = lifted(seam, config)
             if X_BP is not None:
                 fits = (tool.capsules(), tool.X_FT, tool.chord_m, order.lean_rad)
                 check_clearance(self.workpiece.mesh, X_BP, seam, *fits)
@@ -159,7 +168,7 @@ class SeamPlanning(Welder):
             way = find_way(dc.replace(self, config=config, advises=False), seam, X_BP, [order.lean_rad])
         except WeldcalError as problem:
             raise PassError(f"welding.passes[{number}]: {problem}") from problem
-        return seam, way
+        return seam, way, None if config.angles is None else angles_along(seam, config)
 
 
 def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: WeldingState | None) -> PlannedSeam:
@@ -171,16 +180,15 @@ def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: Wel
     record = SeamRecord(root.records[-1].seam, weld_pass=number)
     plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
     try:
-        seam, way = planning.pass_way(felt, number, root.X_BP)
+        seam, way, along = planning.pass_way(felt, number, root.X_BP)
     except WeldcalError as error:
         return dc.replace(plan, seam=None, reason=str(error))
     return dc.replace(
         plan,
         seam=seam,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
+        **way.reached,
+        along=along,
+        records=(*root.records, dc.replace(record, line=seam)),
         touch_arc_m=None,
     )
 
@@ -252,7 +260,7 @@ def plan_seam(
         return dc.replace(
             plan,
             felt=felt,
-            records=(*planning.earlier, record),
+            records=(*planning.earlier, dc.replace(record, line=plan.seam)),
             more=more,
             touch_arc_m=arc,
             part_sigma_m=found.sigma_m,
@@ -415,10 +423,15 @@ def unfelt_sigma(planning: SeamPlanning, found: RootPlan, at: npt.NDArray[np.int
 
 def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
     """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
+    drawn, felt, along = seam, is_felt(planning.workpiece, planning.tool), None
+    if planning.config.angles is not None and not felt:
+        seam, config = lifted(seam, planning.config)
+        planning = dc.replace(planning, config=config)
+    if planning.config.angles is not None:
+        along = angles_along(seam, planning.config)
     way = planning.way(seam, X_BP)
     for number in range(1, len(planning.passes) + 1):  # before the root is welded
-        planning.pass_way(seam, number, X_BP)
-    felt = is_felt(planning.workpiece, planning.tool)
+        planning.pass_way(drawn, number, X_BP)
     share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
         sequence=sequence,
@@ -427,10 +440,10 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         direct=planning.q_from is not None and free_move(planning, planning.q_from, way.q_above, X_BP),
         seam=seam,
         X_BP=X_BP,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
+        **way.reached,
+        along=along,
+        felt_line=None if seam is drawn else drawn,
+        records=(*planning.earlier, SeamRecord(planning.number, line=seam)),
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -484,7 +497,6 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
         return dc.replace(
             _planned(planning, sequence, seam, planning.X_BP_guess),
-            records=records,
             touch_arc_m=arc,
             **again,
             rms_m=0.0,

@@ -1,7 +1,9 @@
 """Computes the weld job's settings from scenario and station: feature, poses, stop criterion, servo."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
@@ -19,14 +21,15 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.models.workpieces.part import WeldPart, is_felt, numbered, seam_count
-from weldcal.models.workpieces.seat import Press, Seated
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered, seam_count
+from weldcal.models.workpieces.seat import Press, Seated, contact_angle
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
 from weldcal.systems.scenario.checks import check_home
-from weldcal.systems.scenario.schema import Scenario, WeldingConfig
+from weldcal.systems.scenario.schema import AnglesOrder, Scenario, WeldingConfig
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.passes.tacks import Tack
@@ -40,6 +43,7 @@ from weldcal.welding.servo.settings import (
     MotionLimits,
     ServoConfig,
     ToolGeometry,
+    TorchAngles,
     TorchControl,
     TouchOnConfig,
 )
@@ -55,6 +59,7 @@ NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
 _UNPRESSED_M = 1e-9  # of a tip that is not used
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 SCAN_CLEAR_M = 0.02  # from a part that is not found yet
+NOZZLE_CLEAR_M = 0.001  # a choice: as the tool's body keeps from the part
 WEAVE_EVERY = 25  # places of a seam at which a weave is checked: 25 mm, a choice
 
 
@@ -123,11 +128,60 @@ def _arm_bounds(scenario: Scenario, station: Station, weave: WeaveConfig, seam: 
     ]
 
 
+def angles_order(scenario: Scenario, cad: WeldPart, seam: int) -> AnglesOrder | None:
+    """What is ordered of the wire's angles on a seam by its number."""
+    spec, part = scenario.workpiece, numbered(cad, seam)
+    of_seam = (
+        spec.seams[part.seam.listed].angles if spec is not None and isinstance(part, Part) and spec.seams else None
+    )
+    return scenario.welding.angles if of_seam is None else of_seam
+
+
+def seam_tool(scenario: Scenario, station: Station, seam: int) -> WeldingTool:
+    """The tool with the stick-out that is ordered for a seam.
+
+    Raises:
+        InputError: the nozzle would touch the joint, or the tool's own stick-out is not known.
+    """
+    tool, cad = station.tool, station.cad
+    assert tool is not None
+    order = None if cad is None else angles_order(scenario, cad, seam)
+    if cad is None or order is None or order.stick_out_mm is None:
+        return tool
+    wanted, section = 1e-3 * order.stick_out_mm, numbered(cad, seam).section
+    beside = min(tool.nozzle_radius_m, max(section.left_m, section.right_m) * np.sin(section.half_angle_rad))
+    least = beside / np.tan(section.half_angle_rad) + NOZZLE_CLEAR_M - TORCH_ABOVE_ROOT_M
+    if wanted < min(least, tool.stick_out_m or least):
+        raise InputError(
+            f"With angles.stick_out_mm: {order.stick_out_mm:g} the nozzle would touch the joint: order"
+            f" {1e3 * least:.1f} or more."
+        )
+    return tool.with_stick_out(wanted)
+
+
+def _torch_angles(scenario: Scenario, tool: WeldingTool, cad: WeldPart, seam: int) -> TorchAngles | None:
+    """The ordered angles of the wire on a seam, with the joint's answer to the tip."""
+    order, part = angles_order(scenario, cad, seam), numbered(cad, seam)
+    if order is None:
+        return None
+    return TorchAngles(
+        work_rad=order.ends_rad("work_angle_deg") or (0.0, 0.0),
+        travel_rad=order.ends_rad("travel_angle_deg"),
+        rotation_rad=order.ends_rad("wire_rotation_deg"),
+        half_angle_rad=contact_angle(part.section, tool.tip_radius_m),
+        stiffness_ratio=tool.axial_stiffness_N_per_m / tool.lateral_stiffness_N_per_m,
+        seat=partial(part.seated, tool) if is_felt(part, tool) else None,
+        stick_out_m=math.nan if tool.stick_out_m is None else tool.stick_out_m,
+    )
+
+
 def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig:
     """The servo's settings without a weave."""
-    tool, welding = station.tool, scenario.welding
-    if tool is None or station.cad is None:
+    welding = scenario.welding
+    if station.tool is None or station.cad is None:
         return ServoConfig()
+    tool = seam_tool(scenario, station, seam)
+    angles = _torch_angles(scenario, tool, station.cad, seam)
     press = Press(tool.press_axial_m, tool.press_lateral_m)
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
@@ -160,6 +214,7 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
         tacks=tacks,
+        angles=angles,
         stitch=StitchConfig() if welding.stitch is None or pieces_of(welding).on_m else welding.stitch.stitch(),
         windows=SeamWindows.of(tool),
         felt=felt,
@@ -170,6 +225,7 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
             from_rest=welding.arc.from_rest(scenario.reports_arc),
             start_s=welding.arc.start_s,
             crater_s=welding.arc.crater_s,
+            work_angle_rad=0.0 if angles is None else 0.5 * sum(angles.work_rad),
         ),
         limits=MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2) if tool.chord_m < NEAR_M else MotionLimits(),
     )

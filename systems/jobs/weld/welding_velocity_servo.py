@@ -144,6 +144,8 @@ class WeldingVelocityServo(LeafSystem):
         config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
         if planned.felt_before is not None:  # the arc begins where it is ordered, however late the power source is
             config = dc.replace(config, torch=dc.replace(config.torch, from_rest=True))
+        if planned.along is not None:
+            config = planned.along.at(config, memory.s_tip, memory.s_torch)
         if self._schedule is not None:
             config = at_gap(config, self._schedule, planned.gap, memory)
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)

@@ -20,7 +20,7 @@ from weldcal.welding.record.process import (
     WeldProcess,
     path_error,
     speed_along,
-    torch_angles,
+    wire_angles,
 )
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -96,12 +96,14 @@ def test_a_speed_needs_two_points_and_a_time_that_rises(time: list[float]) -> No
         speed_along(time, np.zeros((len(time) if len(time) < 3 else 2, 3)))
 
 
-def test_a_tool_that_leans_shows_it_in_the_angle_of_that_axis() -> None:
-    leaning = [RollPitchYaw(0.10, 0.0, 0.7), RollPitchYaw(0.0, -0.20, -1.1)]
-    R = np.array([rpy.ToRotationMatrix().matrix() for rpy in leaning])
-    work, travel = torch_angles(R, np.tile([0.0, 0.0, 1.0], (2, 1)), work_angle_rad=0.02)
-    assert work == pytest.approx([0.10 - 0.02, -0.02])
-    assert travel == pytest.approx([0.0, 0.20])
+def test_a_wire_that_leans_shows_it_in_the_angle_of_that_direction() -> None:
+    # about the direction of travel, about the left, and a wire that leans back in a tool that is level
+    R = np.array([RollPitchYaw(*rpy).ToRotationMatrix().matrix() for rpy in ((0.10, 0, 0), (0, -0.20, 0), (0, 0, 0))])
+    frame = [np.tile(axis, (3, 1)) for axis in np.eye(3)]
+    work, travel = wire_angles(R, *frame)
+    assert work == pytest.approx([0.10, 0.0, 0.0])
+    assert travel == pytest.approx([0.0, 0.20, 0.0])  # the tip is higher, and the wire points forward: push
+    assert wire_angles(R[2:], *[axis[2:] for axis in frame], tilt_rad=0.3)[1] == pytest.approx([0.3])
 
 
 def test_the_ends_of_a_weld_are_measured_apart_from_its_middle() -> None:

@@ -167,6 +167,6 @@ def test_the_rows_of_several_welds_are_told_apart_by_their_touch() -> None:
     phases = [Phase.TOUCH, Phase.TOUCH, Phase.TRACK, Phase.COAST, Phase.TRACK, Phase.FINISH, Phase.TOUCH, Phase.TRACK]
     n, none = len(phases), np.zeros(0)
     codes = np.array([PHASE_CODES[phase] for phase in phases])
-    rest = ("p_BTip", "p_BRobot", "R_BT", "p_BTorch", "deflection_T", "sigma_min")
+    rest = ("p_BTip", "p_BRobot", "R_BT", "p_BW", "p_BTorch", "work", "travel", "deflection_T", "sigma_min")
     log = WeldLog(time=np.arange(n), telemetry={"phase": codes}, torch_on=np.ones(n, bool), **dict.fromkeys(rest, none))
     assert [part.nonzero()[0].tolist() for part in welds(log)] == [[0, 1, 2, 3, 4, 5], [6, 7]]
