@@ -381,8 +381,8 @@ _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
     "wrong flange size": _flange, "unit mix": _units, "poses too alike": _alike,
     "scanner out of focus or range": _focus,
     "warm-up drift": _drift, "slack flange or loose mount": _slack, "wrong kinematics file": _kinematics,
-    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn, "torch bent or moved": _bent,
-    "the run was held": _held,
+    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn,
+    "torch bent or moved": _bent, "the run was held": _held,
     "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
     "too few scans": _few, "unexplained": _unexplained, "position columns exchanged": _misread,
 }  # fmt: skip

@@ -236,8 +236,10 @@ class UrLink:
             stop_program(self._config.host)
 
     def _cause(self, ended: bool) -> Fault:
-        """Return the fault of a worker that gives no state: after a lost connection ur_rtde may crash, or connect again
-        inside a call for as long as it takes."""
+        """Return the fault of a worker that gives no state.
+
+        After a lost connection ur_rtde may crash, or connect again inside a call for as long as it takes.
+        """
         if ended:
             return Fault.LINK_CLOSED if "reconnecting" in self._output().lower() else Fault.WORKER_DIED
         calling = self._memory.calling.read()
