@@ -29,8 +29,7 @@ from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
 from weldcal.tools.report.doctor import CALIBRATION, DoctorReport, worded
-from weldcal.welding.record.signs import PICTURE_S, blind_s, gain_off
-from weldcal.welding.record.weld_log import CSV_NAME, WeldRecord, load_weld_log
+from weldcal.welding.record.weld_log import CSV_NAME, PICTURE_S, WeldRecord, blind_s, gain_off, load_weld_log
 
 _LOOKED_AT = 3  # scans in which other flanges are tried
 _SEEN = 0.8  # of the edge

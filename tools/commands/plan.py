@@ -1,5 +1,6 @@
-"""weldcal plan-motion and plan-poses: the motion, or the poses of scans, that determine most, before any recording."""
+"""weldcal plan-motion, plan-poses and plan-passes: what determines most before a recording, what fills a joint."""
 
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,14 +22,18 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
+from weldcal.models.workpieces.part import numbered, seam_count
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.jobs.motion.job import MotionJob, plan_corners
 from weldcal.systems.jobs.weld.settings import plan_poses as plan_scan_poses
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.report.files import csv_text, write_json
+from weldcal.welding.passes.bead import WIDEST_M, bead_area, filling_passes
 
 _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; degrees
 _SPEED_M_S = 0.25  # of a part to be scanned: what an error of the clock costs
@@ -248,3 +253,81 @@ def plan_refining_poses(
     write_json(out / "plan.json", result)
     progress("poses", 1.0)
     return result | {"written_to": str(out)}
+
+
+@command("plan-passes", short_help="Propose the passes that fill a joint.")
+def plan_passes(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Joint, speed and wire feed: a scenario by name or YAML file.")
+    ],
+    depth_mm: Annotated[
+        float | None,
+        option("--depth-mm", "MM", "Filled up to this height over the root.", show_default="a groove's depth"),
+    ] = None,
+    wire_feed_m_min: Annotated[
+        float | None, option("--wire-feed-m-min", "M", "Of all passes.", show_default="the scenario's")
+    ] = None,
+    wire_mm: Annotated[float, option("--wire-mm", "MM", "Diameter of the wire.", min=0.5, max=4.0)] = 1.2,
+    widest_mm: Annotated[float, option("--widest-mm", "MM", "Widest bead.", min=2.0)] = 1e3 * WIDEST_M,
+    seam: Annotated[int, option("--seam", "N", "Number of the seam.", min=1)] = 1,
+) -> Outcome:
+    """Compute the beads of a wire feed and a speed, and print the passes after the root as lines for the scenario.
+
+    The metal is counted without loss, and the surface is level. The speed of the passes makes the joint exactly full.
+    """
+    loaded = load_scenario(scenario)
+    half, depth_m = _joint(loaded, seam, depth_mm)
+    speed_m_s = 1e-3 * loaded.welding.speed_mm_s
+    feed_m_s = _feed(loaded, wire_feed_m_min) / 60.0
+    area = bead_area(feed_m_s, 1e-3 * wire_mm, speed_m_s)
+    passes, filling = filling_passes(area, area, half, depth_m, 1e-3 * widest_mm)
+    rows = [
+        {
+            "lateral_mm": round(1e3 * p.lateral_m, 2),
+            "vertical_mm": round(1e3 * p.vertical_m, 2),
+            "speed_mm_s": round(1e3 * speed_m_s * area / filling, 2),
+        }
+        for p in passes
+    ]
+    joint_mm2, beads_mm2 = 1e6 * math.tan(half) * depth_m**2, 1e6 * (area + len(passes) * filling)
+    words = f"{2.0 * math.degrees(half):.0f} deg between the walls, {1e3 * depth_m:.1f} mm deep: {joint_mm2:.1f} mm2"
+    lines = [
+        f"# {words}",
+        f"# root of {1e6 * area:.1f} mm2, passes of {1e6 * filling:.1f} mm2",
+        "welding:",
+        "  passes:" if rows else "  passes: []  # the root fills it",
+        *(f"  - {{{', '.join(f'{key}: {value:g}' for key, value in row.items())}}}" for row in rows),
+    ]
+    found = {"state": "done", "passes": rows, "joint_mm2": joint_mm2, "beads_mm2": beads_mm2}
+    return Outcome(found, text="\n".join(lines))
+
+
+def _joint(scenario: Scenario, number: int, depth_mm: float | None) -> tuple[float, float]:
+    """Half of the angle between the walls, rad, and how high over the root they are filled, m; raises InputError."""
+    spec = scenario.workpiece
+    if spec is None:
+        raise InputError("The scenario has no workpiece, and so no joint to fill: write workpiece.")
+    part = make_workpiece(spec.shape, length_m=1e-3 * spec.length_mm) if spec.file is None else part_of(spec)
+    if number > seam_count(part):
+        raise InputError(f"--seam is {number}, and the part has {seam_count(part)} seams.")
+    drawn = numbered(part, number - 1)
+    if not 0.0 < drawn.half_angle_rad < 0.5 * math.pi - 1e-3:
+        raise InputError("The joint of this seam has no walls with an angle between them: passes fill a V or a fillet.")
+    if depth_mm is None and spec.joint not in (None, "v_groove"):
+        raise InputError(f"A {spec.joint} is filled up to its throat: give it by --depth-mm.")
+    if depth_mm is not None and not (np.isfinite(depth_mm) and 0.0 < depth_mm <= 1e3 * drawn.depth_m + 1e-6):
+        raise InputError(f"--depth-mm must be above 0 and at most {1e3 * drawn.depth_m:.1f}, the height of the walls.")
+    return drawn.half_angle_rad, drawn.depth_m if depth_mm is None else 1e-3 * depth_mm
+
+
+def _feed(scenario: Scenario, given: float | None) -> float:
+    """The wire feed m/min; raises InputError where it is not known."""
+    welding = scenario.welding
+    scheduled = None if welding.schedule is None else welding.schedule.wire_feed_m_min
+    feed = next((f for f in (given, scheduled, welding.process.wire_feed_m_min) if f is not None), math.nan)
+    if not feed > 0.0:
+        raise InputError(
+            "The wire feed is not known: give --wire-feed-m-min, or write welding.process.wire_feed_m_min."
+        )
+    return feed

@@ -1,4 +1,4 @@
-"""Plans the groove's root from scans: by the drawing registered to them, or from the cloud alone."""
+"""Plans root and tip path from scans: by the drawing registered to them, or from the cloud alone."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,9 +12,11 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
+from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
+from weldcal.models.workpieces.seat import Press
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.part.joint import MOST_M, REACH_M, FitUp, MeasuredJoint, measure_fit_up, measure_joint
@@ -24,9 +26,12 @@ from weldcal.welding.locate.part.result import PartConfig, PartRegistration
 from weldcal.welding.locate.part.scan import prepare
 from weldcal.welding.locate.planes import Floats, finite_points, into
 from weldcal.welding.locate.registration import register_workpiece
+from weldcal.welding.seam.curve import SeamCurve, ringed
 
 METHODS = ("cad", "cloud")
 SEARCHES = ("guess", "anywhere")
+OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
+TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
 @dataclass(frozen=True)
@@ -231,3 +236,43 @@ def plan_root_anyhow(
     R = R_BU.matrix()
     X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
     return replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
+
+
+def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
+    """The path of the seated tip's centre, in B.
+
+    Where `length_m` of arc is given the seam ends there, and the path goes on.
+    """
+    seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
+    line = workpiece.seam_P + seated.above_m * workpiece.up_P
+    R = X_BP.rotation().matrix()
+    ups = np.broadcast_to(workpiece.up_P, line.shape) @ R.T
+    return _cut(line @ R.T + X_BP.translation(), ups, tool, length_m)
+
+
+def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
+    """The seam along points (N,3) m.
+
+    Where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
+
+    A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
+    """
+    line, ups, turn_m = ringed(line, ups)
+    if turn_m is not None:
+        length_m = turn_m + OVERLAP_M if length_m is None else min(length_m, turn_m + OVERLAP_M)
+    if length_m is None:
+        return SeamCurve.from_points(line, up=ups)
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    used = s <= length_m + TIP_AHEAD * tool.chord_m
+    return SeamCurve.from_points(line[used], up=ups[used], length=length_m)
+
+
+def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_m: float | None = None) -> SeamCurve:
+    """The path of the seated tip's centre `above_m` over a planned root; None: by the groove's angle in the scan.
+
+    Raises:
+        InputError: for a root too short for a seam.
+    """
+    height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m if above_m is None else above_m
+    ups = np.broadcast_to(plan.up, plan.root.shape)
+    return _cut(plan.root + height * ups, ups, tool, length_m)

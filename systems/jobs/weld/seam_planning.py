@@ -22,13 +22,21 @@ from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, free_mov
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.welding.locate.part.joint import FitUp, check_fit_up
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root_anyhow
+from weldcal.welding.locate.planning import (
+    OVERLAP_M,
+    TIP_AHEAD,
+    PlanningMethod,
+    RootPlan,
+    plan_root_anyhow,
+    seam_above,
+    tip_seam,
+)
 from weldcal.welding.passes.angles import AnglesAlong, angles_along, lifted
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
-from weldcal.welding.seam.curve import SeamCurve, ringed
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.restart import SPARE_M, Restart
 from weldcal.welding.servo.settings import ServoConfig
@@ -40,7 +48,6 @@ Views = tuple[ScanView, ...]
 PassPlan = tuple[SeamCurve, ArmWay, AnglesAlong | None]
 
 
-OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 TACK_BESIDE_M = 3e-3  # a choice: about a tack, above what a scan and a list are off along the seam
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 _DRAWN = "the pose of the part is from the fixture's drawing; the scan was not used"
@@ -49,9 +56,6 @@ UNFELT = "followed from the scan and the drawing; not felt"
 
 class UncertainSeam(WeldcalError):
     """A seam that the tip does not feel is not known well enough."""
-
-
-TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
@@ -447,46 +451,6 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
-
-
-def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre, in B.
-
-    Where `length_m` of arc is given the seam ends there, and the path goes on.
-    """
-    seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
-    line = workpiece.seam_P + seated.above_m * workpiece.up_P
-    R = X_BP.rotation().matrix()
-    ups = np.broadcast_to(workpiece.up_P, line.shape) @ R.T
-    return _cut(line @ R.T + X_BP.translation(), ups, tool, length_m)
-
-
-def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The seam along points (N,3) m.
-
-    Where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
-
-    A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
-    """
-    line, ups, turn_m = ringed(line, ups)
-    if turn_m is not None:
-        length_m = turn_m + OVERLAP_M if length_m is None else min(length_m, turn_m + OVERLAP_M)
-    if length_m is None:
-        return SeamCurve.from_points(line, up=ups)
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    used = s <= length_m + TIP_AHEAD * tool.chord_m
-    return SeamCurve.from_points(line[used], up=ups[used], length=length_m)
-
-
-def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_m: float | None = None) -> SeamCurve:
-    """The path of the seated tip's centre `above_m` over a planned root; None: by the groove's angle in the scan.
-
-    Raises:
-        InputError: for a root too short for a seam.
-    """
-    height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m if above_m is None else above_m
-    ups = np.broadcast_to(plan.up, plan.root.shape)
-    return _cut(plan.root + height * ups, ups, tool, length_m)
 
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:

@@ -24,14 +24,14 @@ from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.jobs.weld.arm_way import Welder, find_way, free_move, leans_with_clearance
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, seam_above
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.tools.worlds.weld.budgets import PERFECT
 from weldcal.tools.worlds.weld.plant import groove_config, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
-from weldcal.welding.locate.planning import RootPlan
+from weldcal.welding.locate.planning import RootPlan, seam_above
 from weldcal.welding.seam.clearance import NoClearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry

@@ -17,11 +17,11 @@ from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background import Answer
 from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, arm_waypoints
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanner
-from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, tip_seam
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
 from weldcal.systems.motion.buffers import PoseHistory
-from weldcal.welding.locate.planning import PlanningMethod
+from weldcal.welding.locate.planning import PlanningMethod, tip_seam
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose

@@ -37,7 +37,6 @@ from weldcal.systems.jobs.weld.seam_planning import (
     added_variance,
     plan_root_anyhow,
     plan_seam,
-    tip_seam,
     unfelt_sigma,
 )
 from weldcal.systems.jobs.weld.tip_to_torch import torch_sigma
@@ -45,7 +44,7 @@ from weldcal.systems.messages import PlannedSeam, Scan
 from weldcal.tools.report.weld import fit_up_csv, fit_up_document
 from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.tools.worlds.wrong_models import station
-from weldcal.welding.locate.planning import RootPlan
+from weldcal.welding.locate.planning import RootPlan, tip_seam
 from weldcal.welding.record.process import path_error
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.tool_axes import tool_path
