@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import fit_rigid, rotation_vector
+from weldcal.calibration.geometry.se3 import fit_rigid
 from weldcal.calibration.published.algorithm1 import FAILED, Method, VerificationError, registered
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -221,16 +221,3 @@ def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, 
 def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
     """Eq. (10)-(12) on every pair, without weights or outlier rejection: Table 1's calibration."""
     return fit_rigid(np.array([o.p_BR for o in pairs]), np.array([o.p_CR for o in pairs]))
-
-
-def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:
-    """Return the paper's e_icp as (6,) rotation vector (rad) and displacement of the flange centre (m), in axes of F.
-
-    It is the same transform as at the camera's origin, without the lever of the working distance. Infinite where the
-    ICP failed.
-    """
-    if error.X_CpC is None:
-        return np.full(6, np.inf)
-    X_FC = X_BF.InvertAndCompose(X_BC)
-    E_F = (X_FC @ error.X_CpC @ X_FC.inverse()).inverse()
-    return np.concatenate([rotation_vector(E_F.rotation()), E_F.translation()])

@@ -21,7 +21,6 @@ from weldcal.calibration.published.pipeline import (
     PublishedParameters,
     PublishedVerification,
     all_pairs,
-    at_flange,
     circumcircles,
     find_centres,
     published_model,
@@ -110,13 +109,10 @@ def test_the_published_error_is_taken_at_the_camera_where_a_turn_of_the_flange_i
     X_FC = X_CF.inverse()
     wrong = X_BC @ X_CF @ RigidTransform(RollPitchYaw(tilt, 0, 0), [0, 0, 0]) @ X_FC
     error = v(wrong)
-    there = at_flange(error, wrong, v.X_BF)
-    # most of the tilt shows, and puts its lever of 0.6 m into the paper's translation, but hardly moves the flange
+    # most of the tilt shows, and puts its lever of 0.6 m into the paper's translation
     assert np.linalg.norm(error.value[3:]) > 0.5 * 0.6 * tilt
-    assert np.linalg.norm(there[3:]) < 0.1 * 0.6 * tilt
     far = v(X_BC @ RigidTransform([0, 0, 0.2]))
     assert not far.found
-    assert np.isinf(at_flange(far, X_BC, v.X_BF)).all()
 
 
 def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -> None:

@@ -1,11 +1,10 @@
-"""Times the detection of the flange: weldcal, the paper's loop, an Open3D chain and a PCL-style random search."""
+"""Times the detection of the flange: weldcal, and the paper's loop."""
 
 import time
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import numpy as np
-import open3d as o3d
 
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.arrays import Array
@@ -60,12 +59,6 @@ def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress
     for k, (name, job, target) in enumerate(ours):
         progress("ours", 0.1 + 0.08 * k)
         rows.append(_time(f"weldcal, {name}", job, _REPEATS, truth, target))
-    progress("the others", 0.55)
-    rows.append(_time("PCL-style random circles in NumPy, segmented cloud", lambda: _ransac(cloud, seed), 3, truth))
-    progress("the others", 0.65)
-    rows.append(
-        _time("Open3D chain, 0.5 Mpx frame", lambda: _open3d_chain(frames["0.5"].points_C, float(truth[2])), 1, truth)
-    )
     if loop:
         progress("the paper's loop", 0.8)
         rows.append(
@@ -117,61 +110,25 @@ def _circle(a: Array, b: Array, c: Array) -> tuple[Array, float]:
     return a + out, float(np.linalg.norm(out))
 
 
-def _search(points: Array, seed: int, count: Callable[[Array, float], int]) -> Array | None:
-    """Section 2.1.4: draw three points, check the circle's radius, count the points near it; the best centre."""
-    rng = np.random.default_rng(seed)
+def _paper_loop(points: Array, seed: int) -> Array | None:
+    """Section 2.1.4 as the paper's Python program does it: of circles through three points the one with most points.
+
+    Circles of another radius are left out; points are counted one by one.
+    """
+    rng, everything = np.random.default_rng(seed), points.tolist()
     best, most = None, 0
     for _ in range(_K_MAX):
         center, radius = _circle(*points[rng.integers(0, len(points), 3)])
         if abs(radius - PAPER_RADIUS_M) > _E_R:
             continue
-        agree = count(center, radius)
-        if agree > most:
-            best, most = center, agree
-    return best
-
-
-def _paper_loop(points: Array, seed: int) -> Array | None:
-    """Return the search as the paper's Python program does it: points are counted one by one."""
-    everything = points.tolist()
-
-    def count(center: Array, radius: float) -> int:
         x, y, z = center.tolist()
         agree = 0
         for px, py, pz in everything:
             if abs(((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) ** 0.5 - radius) < _E_D:
                 agree += 1
-        return agree
-
-    return _search(points, seed, count)
-
-
-def _ransac(points: Array, seed: int) -> Array | None:
-    """Return the search with each count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
-    return _search(points, seed, lambda c, r: int((np.abs(np.linalg.norm(points - c, axis=1) - r) < _E_D).sum()))
-
-
-def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
-    """Find the circle by library calls: depth gate, outlier removal, planes, clusters, circle search."""
-    p = frame.reshape(-1, 3)
-    p = p[np.isfinite(p).all(axis=1)]
-    p = p[np.abs(p[:, 2] - depth_m) < 0.04]
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
-    cloud, _ = cloud.remove_statistical_outlier(50, 2.0)
-    o3d.utility.random.seed(0)
-    for _ in range(6):
-        if len(cloud.points) < 500:
-            return None
-        _, inside = cloud.segment_plane(0.0008, 3, 500)
-        face = cloud.select_by_index(inside)
-        labels = np.asarray(face.cluster_dbscan(0.003, 8))
-        points = np.asarray(face.points)
-        for k in range(int(labels.max()) + 1):
-            part = points[labels == k]
-            if len(part) > 400 and 0.055 < float(np.ptp(part, axis=0).max()) < 0.07:
-                return _ransac(part, 0)
-        cloud = cloud.select_by_index(inside, invert=True)
-    return None
+        if agree > most:
+            best, most = center, agree
+    return best
 
 
 def _speed_rows(f: Figures) -> Iterable[Row]:
@@ -184,24 +141,21 @@ def _speed_rows(f: Figures) -> Iterable[Row]:
 
 SPEED = Study(
     name="flange",
-    what=(
-        "Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search."
-    ),
+    what="Processor time to find the flange in a scan, beside the paper's loop.",
     header=("method and scan", "median ms", "least ms", "", "centre off, mm"),
     rows=_speed_rows,
     numbers=4,
 )
 
 
-@command("benchmark flange-speed", short_help="Time the detection of the flange beside other chains.", hidden=True)
+@command("benchmark flange-speed", short_help="Time the detection of the flange beside the paper's.", hidden=True)
 def speed(
     call: Call,
     loop: Annotated[
         bool, switch("--loop/--no-loop", "Also run the paper's search as a Python loop; takes seconds.")
     ] = True,
 ) -> Outcome:
-    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style
-    search."""
+    """Time the detection of the flange in a scan and compare with the paper's loop."""
     folder, rows = SPEED.folder(call), run_flange_benchmark(call.seed, loop=loop, progress=call.progress)
     return SPEED.found({"rows": rows}, folder)
 

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
-from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, full_problem, linearise
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, pose_difference, solve_axb_ycz, solve_problem
+from weldcal.calibration.hand_eye.problem import Problem, full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
@@ -44,16 +43,12 @@ class DatasetRow:
     deg: float
     mm: float
     best_deg: float
-    best_deg_by: str
     best_mm: float
-    best_mm_by: str
     flagged: tuple[int, ...]
     unobservable: tuple[str, ...]
     method: str
     low_deg: float = float("nan")
     low_mm: float = float("nan")
-    truth_deg: float | None = None
-    truth_mm: float | None = None
     truth_nees: float | None = None
     truth_nees_corners: float | None = None
     corners: str = ""
@@ -112,9 +107,7 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
         deg=ours.held_out.rms_deg,
         mm=1e3 * ours.held_out.rms_translation,
         best_deg=deg[by_deg],
-        best_deg_by=by_deg,
         best_mm=mm[by_mm],
-        best_mm_by=by_mm,
         flagged=tuple(int(i) for i in np.nonzero(~ours.inliers)[0]),
         unobservable=ours.unobservable,
         method=ours.method,
@@ -127,14 +120,7 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
         )
     if truth is None:
         return row
-    X = as_transform(truth)
-    e = pose_difference(ours.X, X)
-    return replace(
-        row,
-        truth_deg=float(np.degrees(np.linalg.norm(e[:3]))),
-        truth_mm=1e3 * float(np.linalg.norm(e[3:])),
-        truth_nees=ours.normalised_error("X", X),
-    )
+    return replace(row, truth_nees=ours.normalised_error("X", as_transform(truth)))
 
 
 def lowest_ratio(ours: Array, theirs: Array, seed: int = 0) -> float:
@@ -175,105 +161,6 @@ def coverage(mounting: str, trials: int, n: int = 20, seed: int = 0, progress: P
         held += result.normalised_error("X", as_transform(truth["X"])) < result.region(0.95)
         progress(mounting, (k + 1) / trials)
     return held / trials
-
-
-def outliers(seed: int) -> tuple[bool, float]:
-    """30 of 100 percent gross outliers: all flagged and no other, and the worst ratio to the clean fit's own error."""
-    rng = np.random.default_rng(seed)
-    problem, truth = simulated("eye_in_hand", 30, rng, float(np.radians(0.05)), 2e-4)
-    bad = np.zeros(30, dtype=bool)
-    bad[rng.choice(30, 9, replace=False)] = True
-    clean = solve_problem(problem.pick(~bad), config=_PLAIN)
-    G = problem.G.copy()
-    G[bad] = G[bad] @ pose(exp_rotation(rng.normal(size=(9, 3)) * 0.5), rng.normal(size=(9, 3)) * 0.1)
-    dirty = solve_problem(full_problem(problem.F, G), config=_PLAIN)
-    ratios = []
-    for part in (slice(0, 3), slice(3, 6)):
-        e, c = (np.linalg.norm(pose_difference(r.X, as_transform(truth["X"]))[part]) for r in (dirty, clean))
-        ratios.append(float(e / c))
-    return bool((dirty.inliers == ~bad).all()), max(ratios)
-
-
-def invariance(seed: int = 0) -> float:
-    """Largest relative difference of the answer after a change of unit, of all four frames, and of the order."""
-    rng = np.random.default_rng(seed)
-    problem, _ = simulated("eye_in_hand", 25, rng, float(np.radians(0.05)), 2e-4)
-    base = solve_problem(problem, config=_PLAIN)
-    X = base.X.GetAsMatrix4()
-    left, hand, camera, target = pose(exp_rotation(rng.normal(size=(4, 3))), rng.normal(size=(4, 3)))
-    F, G = problem.F.copy(), problem.G.copy()
-    F[:, :3, 3] *= 1e3
-    G[:, :3, 3] *= 1e3
-    mm = solve_problem(full_problem(F, G), config=_PLAIN).X.GetAsMatrix4()
-    mm[:3, 3] /= 1e3
-    frames = solve_problem(full_problem(left @ problem.F @ hand, camera @ problem.G @ target), config=_PLAIN)
-    order = rng.permutation(25)
-    shuffled = solve_problem(problem.pick(order), config=_PLAIN).X.GetAsMatrix4()
-    answers = (mm, hand @ frames.X.GetAsMatrix4() @ camera, shuffled)
-    return max(float(np.abs(Y - X).max()) for Y in answers) / float(np.linalg.norm(X[:3, 3]))
-
-
-def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]:
-    """Solve AXB = YCZ with 30 poses, 0.1 mm and 0.02 degrees, from random starts.
-
-    Returns how many end within twice the Cramer-Rao bound in all three unknowns, the worst error, and the rms error
-    over all starts, both in units of the bound.
-
-    The error of an unknown is the root of its squared error in units of the bound's covariance, per number. (An error
-    norm compared with the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
-    """
-    turn, shift = float(np.radians(0.02)), 1e-4
-    ratios = []
-    for k in range(starts):
-        rng = np.random.default_rng(seed + k)
-        problem, truth = simulated("co_manipulation", 30, rng, turn, shift)
-        state = (truth["X"], truth["Y"], truth["Z"])
-        bound = Scaled(problem, linearise(problem, state, np.zeros(3)), Noise(turn**2, shift**2), Loss.SQUARES).V
-        guess = [as_transform(p) for p in pose(Rotation.random(3, rng=rng).as_matrix(), rng.normal(size=(3, 3)))]
-        result = solve_axb_ycz(problem.F, problem.G, problem.H, _PLAIN, starts=[(guess[0], guess[1], guess[2])])
-        row = []
-        for i, name in enumerate("XYZ"):
-            e = pose_difference(result.poses[name], as_transform(truth[name]))
-            s = slice(6 * i, 6 * i + 6)
-            row.append(float(np.sqrt(e @ np.linalg.solve(bound[s, s], e) / 6.0)))
-        ratios.append(row)
-    table = np.array(ratios)
-    return int((table.max(axis=1) < 2.0).sum()), float(table.max()), float(np.sqrt((table**2).mean(axis=0)).max())
-
-
-def degenerate(seed: int = 0) -> dict[str, str]:
-    """Return the error or unobservable direction of undetermined motions; "answer": a number without a warning."""
-    rng = np.random.default_rng(seed)
-    problem, truth = simulated("eye_in_hand", 20, rng, float(np.radians(0.05)), 2e-4)
-    X, Y = truth["X"], truth["Y"]
-    noise = pose(exp_rotation(rng.normal(size=(20, 3)) * 1e-3), rng.normal(size=(20, 3)) * 2e-4)
-
-    def seen(F: Array) -> Problem:
-        return full_problem(F, inverse(F @ X) @ Y @ noise[: len(F)])
-
-    still, turning = problem.F.copy(), problem.F.copy()
-    still[:, :3, :3] = still[0, :3, :3]
-    turning[:, :3, :3] = exp_rotation(rng.uniform(-1.0, 1.0, (20, 1)) * [0.0, 0.0, 1.0])
-    flat = inverse(pose(np.eye(3), rng.normal(size=(20, 3)) * [0.3, 0.3, 0.0]))
-    none = np.zeros(20, dtype=bool)
-    points = replace(seen(flat), full=none, normal=none, free=(True, False, False))
-    cases = {
-        "single axis": (seen(turning), (IDENTITY,) * 3),
-        "pure translation": (seen(still), (IDENTITY,) * 3),
-        "coplanar points": (points, (IDENTITY, Y, IDENTITY)),
-        "two poses": (seen(problem.F[:2]), (IDENTITY,) * 3),
-        "repeated poses": (seen(np.repeat(problem.F[:2], 10, axis=0)), (IDENTITY,) * 3),
-    }
-    out = {}
-    for name, (case, known) in cases.items():
-        try:
-            result = solve_problem(case, known, config=_PLAIN)
-        except WeldcalError as e:
-            out[name] = type(e).__name__
-            continue
-        sure = not np.isfinite(result.joint_covariance).all() or not result.unobservable
-        out[name] = "answer" if sure else result.unobservable[0].split(" (")[0]
-    return out
 
 
 def speed(n: int = 200, repeats: int = 7, peers: int = 3) -> dict[str, float]:
@@ -322,30 +209,15 @@ def run_hand_eye_benchmark(
                 row = replace(row, truth_nees_corners=nees, corners=refined.sentence)
         report.rows.append(row)
         progress(path.parent.name, 0.3 * (k + 1) / len(sets))
-    tries = [outliers(seed + k) for k in range(3 if quick else 20)]
-    ratio = max(r for _, r in tries)
-    report.checks["outliers 30 %"] = (
-        all(f for f, _ in tries) and ratio <= 1.2,
-        f"{sum(f for f, _ in tries)} of {len(tries)} flagged exactly, worst ratio to the clean fit {ratio:.3f}",
-    )
     flagged = [r.flagged for r in report.rows if r.name == "handeye_calib_camodocal"]
     if flagged:
         report.checks["outlier of camodocal"] = (flagged == [(36,)], f"flagged {flagged[0]}")
-    verdict = degenerate(seed)
-    seen = "; ".join(f"{k}: {v}" for k, v in verdict.items())
-    report.checks["degenerate motion"] = ("answer" not in verdict.values(), seen)
     worlds = 3 if quick else 300
     verdicts = fuzz(worlds, seed)
     bad = sum(c["NAN"] + c["WRONG"] for c in verdicts.values())
     wrong = [c for m, c in verdicts.items() if m not in ("none", "target size")]
     named = f"of {sum(sum(c.values()) for c in wrong)} with a mistake {sum(c['named'] for c in wrong)} named"
     report.checks["random worlds"] = (bad == 0, f"{worlds}: {bad} NaN or confident and wrong; {named}")
-    relative = invariance(seed)
-    report.checks["invariance"] = (relative < 1e-9, f"{relative:.1e} relative")
-    starts = 3 if quick else 100
-    good, worst, rms = three_unknowns(starts, seed)
-    said = f"{good} of {starts} within 2x the bound, worst {worst:.2f}x, rms {rms:.2f}x"
-    report.checks["AXB = YCZ"] = (good == starts, said)
     progress("uncertainty", 0.5)
     trials = 12 if quick else 500
     for k, name in enumerate(MOUNTINGS):

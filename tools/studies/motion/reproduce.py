@@ -20,7 +20,7 @@ from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_moti
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.published.algorithm1 import Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.algorithm1 import Verification, icp_error, make_verification
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
@@ -131,8 +131,7 @@ def motion(
 def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: Progress) -> dict[str, dict[str, Any]]:
     """Run the study and write `dataset` with truth.json: its figures, and what the pictures are drawn from.
 
-    Errors of X_BC are in mm at the cube's centre and at the camera's origin, and in degrees. `icp_share` is the share
-    of a shift along x, y and z that point-to-point ICP reports.
+    Errors of X_BC are in mm at the cube's centre and at the camera's origin, and in degrees.
     """
     start = time.monotonic()
     world = MotionWorld(
@@ -144,9 +143,7 @@ def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: 
     write_motion_dataset(world, recorded, truth_file, lambda stage, f: progress(stage, 0.6 * f))
     data = load_motion_dataset(recorded)
     motion = ContinuousMotion(data.stream)
-    begun = time.monotonic()
     seen = see_frames(data, world.flange, motion, seed=seed, tell=lambda f: progress("fits", 0.6 + 0.15 * f))
-    fit_ms = 1e3 * (time.monotonic() - begun) / len(data.frames)
     observed = seen.observed
     progress("calibration in motion", 0.76)
     found = estimate_in_motion(observed, motion)
@@ -202,8 +199,6 @@ def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: 
     figures: dict[str, Any] = {
         "quick": quick,
         "table_1": {name: _row(e) for name, e in rows.items()},
-        "icp_share": list(verify.share(observed.ids[chosen[0]], at_capture[chosen[0]], found.X_BC)),
-        "largest_unsynchronised_mm": float(np.abs(before[:, 3:]).max()),
         "X_BC_error": errors,
         "clock_offset_ms": float("nan") if offset is None else 1e3 * offset,
         "clock_offset_sigma_ms": None if found.clock.sigma_s is None else 1e3 * found.clock.sigma_s,
@@ -217,11 +212,6 @@ def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: 
         },
         "compensation_rms_mm": both_ways,
         "quality": quality,
-        "throughput": {
-            "pixels": float(world.scanner.width * world.scanner.height),
-            "fit_ms_per_frame_with_reading": fit_ms,
-            "frames_per_second_from_files": 1e3 / fit_ms,
-        },
         "frames": len(data.frames),
         "frames_seen": len(observed),
         "wall_seconds": time.monotonic() - start,
@@ -337,11 +327,6 @@ class _Verifier:
         verification = replace(self.model(id), X_BR=_rigid(X_BF), max_distance_m=max(_REACH_M, 2.0 * off))
         found = icp_error(X_BC, verification)
         return np.asarray(found.value * _TO_MM), found.X_CpC
-
-    def share(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[float, float, float]:
-        """Share of a known shift along x, y and z that the registration of this frame reports."""
-        x, y, z = sight(X_BC, replace(self.model(id), X_BR=_rigid(X_BF))).share[3:]
-        return float(x), float(y), float(z)
 
     def errors(
         self, ids: tuple[str, ...], which: NDArray[np.intp], poses: Array, X_BC: RigidTransform

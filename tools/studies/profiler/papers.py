@@ -68,7 +68,6 @@ class EdgeRow:
     d_mean_mm: float
     d_std_mm: float
     radius_mm: float
-    radius_error_mm: float
 
     @property
     def met(self) -> bool | None:
@@ -112,8 +111,7 @@ def edge_rows(
     rows = []
     for (n, method), values in found.items():
         v = np.array(values)
-        off = float(np.abs(v[:, 8] - 20.0).mean())
-        figures = [*np.sqrt((v[:, :4] ** 2).mean(axis=0)).tolist(), *v[:, 4:].mean(axis=0).tolist(), off]
+        figures = [*np.sqrt((v[:, :4] ** 2).mean(axis=0)).tolist(), *v[:, 4:].mean(axis=0).tolist()]
         columns = [field.name for field in fields(EdgeRow)]
         rows.append(EdgeRow(**dict(zip(columns, (name, n, method, len(v), *figures), strict=True))))
     return rows

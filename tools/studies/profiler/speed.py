@@ -1,4 +1,4 @@
-"""Times the calibration of a profiler by an edge without a guess, the paper's method and a grid search."""
+"""Times the calibration of a profiler by an edge without a guess, and by the paper's method."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -6,13 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.profiler.edge.joint import edge_starts
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
@@ -20,11 +17,9 @@ from weldcal.tools.console import Progress
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.studies.profiler.seeds import profiler_seeds
-from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.worlds.edge_trials import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 SETS = 20
-SEARCHED = 5  # sets on which the search is tried
-GRID_ROTATIONS, GRID_REACH_M, GRID_STEPS, POLISHED = 2000, 0.2, 5, 20
 TARGET_S = 0.2
 SAME_DEG, SAME_MM = 0.01, 0.01  # from the optimum that a start at the truth leads to: that one was found
 
@@ -38,7 +33,7 @@ def benchmark_speed(
         Path | None, option("--data", "FOLDER", "The fixed files. Without them, sets generated from the seed.")
     ] = None,
 ) -> Outcome:
-    """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
+    """Time the profiler's calibration by an edge and compare it with the published method."""
     folder = SPEED.folder(call)
     return SPEED.found(time_methods(call.seed, data, call.progress), folder)
 
@@ -68,15 +63,9 @@ def time_methods(seed: int, data: Path | None, progress: Progress) -> dict[str, 
         progress(f"40 free poses, {level} noise", 0.15 * k)
         best = [_from_truth(t) for t in free]
         rows.append(_row("joint, no guess", f"40 free, {level} noise", free, _joint, best))
-        if level == "paper":
-            rows.append(_row("its 24 starts alone", f"40 free, {level} noise", free, _starts, None))
-            progress("the search", 0.2)
-            few = free[:SEARCHED]
-            rows.append(_row("grid search, SciPy", f"40 free, {level} noise", few, _searched, best[:SEARCHED]))
     arcs = sets("tilt_paper", 10)
     progress("the paper's method", 0.8)
     rows.append(_row("joint, no guess", "25 x 10, paper noise", arcs, _joint, [_from_truth(t) for t in arcs]))
-    rows.append(_row("paper, all pairs as printed", "25 x 10, paper noise", arcs, _paper_pairs, None))
     rows.append(_row("paper, centred", "25 x 10, paper noise", arcs, _paper, None))
     free_rows = [r for r in rows if r["method"] == "joint, no guess" and r["poses"].startswith("40")]
     return {
@@ -98,7 +87,7 @@ def _lines(figures: Figures) -> Iterable[Row]:
 
 SPEED = Study(
     name="profiler",
-    what="Time of a profiler's calibration by an edge without a guess, the paper's method and a grid search.",
+    what="Time of a profiler's calibration by an edge without a guess, and by the paper's method.",
     header=("method", "poses", "median ms", "most ms", "processor ms", "most ms", "optimum found", "off deg", "off mm"),
     rows=_lines,
     numbers=7,
@@ -109,7 +98,7 @@ def _row(
     method: str,
     poses: str,
     trials: Sequence[EdgeTrial],
-    solve: Callable[[EdgeTrial], Answer | None],
+    solve: Callable[[EdgeTrial], Answer],
     best: list[Answer] | None,
 ) -> dict[str, Any]:
     """Time a method on sets: wall and processor s (median, largest), how often it found the optimum, rms error."""
@@ -119,8 +108,6 @@ def _row(
         answer = solve(trial)
         seconds.append(time.perf_counter() - start)
         worked.append(time.process_time() - begun)
-        if answer is None:
-            continue
         errors.append(trial.error(*answer))
         if best is not None:
             deg, mm = _apart(answer, best[k])
@@ -154,63 +141,6 @@ def _from_truth(t: EdgeTrial) -> Answer:
     return _joint(t, t.truth)
 
 
-def _starts(t: EdgeTrial) -> None:
-    edge_starts(t.poses, t.points)
-
-
 def _paper(t: EdgeTrial) -> Answer:
     e = t.paper()
     return e.rotation, e.translation
-
-
-def _paper_pairs(t: EdgeTrial) -> Answer:
-    """Its translation from every pair of poses of different groups (Eq. 28 to 35), after its rotation."""
-    group = np.repeat(np.arange(len(t.poses) // TRANSLATIONS), TRANSLATIONS)
-    e = t.paper()
-    i, j = np.triu_indices(len(t.poses), 1)
-    other = group[i] != group[j]
-    i, j = i[other], j[other]
-    across = skew(e.direction).T
-    p = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]]) @ e.rotation.T
-    seen = np.einsum("nij,nj->ni", t.poses.rotation, p) + t.poses.translation
-    A = across @ (t.poses.rotation[j] - t.poses.rotation[i])
-    b = -(seen[j] - seen[i]) @ across.T
-    return e.rotation, np.linalg.lstsq(A.reshape(-1, 3), b.ravel(), rcond=None)[0]
-
-
-def _searched(t: EdgeTrial) -> Answer:
-    """Search a grid of rotations and translations for the best line, SciPy from the twenty best, polish one."""
-    p_S = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]])
-    axis = np.linspace(-GRID_REACH_M, GRID_REACH_M, GRID_STEPS)
-    shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    shifted = np.einsum("nij,kj->nki", t.poses.rotation, shifts)
-    found: list[tuple[float, Floats]] = []
-    for R in Rotation.random(GRID_ROTATIONS, random_state=0):
-        seen = np.einsum("nij,nj->ni", t.poses.rotation, p_S @ R.as_matrix().T) + t.poses.translation
-        at = seen[:, None] + shifted
-        at = at - at.mean(axis=0)
-        values = np.linalg.eigvalsh(np.einsum("nki,nkj->kij", at, at))
-        k = int(np.argmin(values[:, 0] + values[:, 1]))
-        found.append((float(values[k, 0] + values[k, 1]), np.concatenate([R.as_rotvec(), shifts[k]])))
-    found.sort(key=lambda one: one[0])
-
-    def off(x: Floats) -> Floats:
-        return _off_line(x, t.poses, p_S)
-
-    fits = [
-        least_squares(off, x, x_scale=[1.0] * 3 + [0.1] * 3, loss="cauchy", f_scale=2e-4) for _, x in found[:POLISHED]
-    ]
-    best = min(fits, key=lambda fit: float(fit.cost))
-    turn, shift = np.asarray(Rotation.from_rotvec(best.x[:3]).as_matrix()), np.asarray(best.x[3:])
-    at = np.einsum("nij,nj->ni", t.poses.rotation, p_S @ turn.T + shift) + t.poses.translation
-    e = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][0]
-    return _joint(t, EdgeState(turn, shift, at.mean(axis=0), e))
-
-
-def _off_line(x: Floats, poses: FlangePoses, p_S: Floats) -> Floats:
-    """Components (3 n,) of the points' offsets from the line through them."""
-    p_F = p_S @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:]
-    at = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation
-    at = at - at.mean(axis=0)
-    e = np.linalg.eigh(at.T @ at)[1][:, 2]
-    return np.asarray((at - np.outer(at @ e, e)).ravel())

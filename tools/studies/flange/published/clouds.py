@@ -29,7 +29,6 @@ from weldcal.calibration.published.algorithm1 import (
 from weldcal.calibration.published.pipeline import (
     PublishedVerification,
     all_pairs,
-    at_flange,
     find_centres,
     published_model,
     published_pairs,
@@ -97,8 +96,8 @@ class SplitRow:
 class CloudsOutcome:
     """A folder of scans.
 
-    ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the verification, at the
-    camera (roll, pitch, yaw, x, y, z) and at the flange. ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
+    ``table1_camera`` (n, 6): e_icp of the all-circles H with each scan as the verification, at the camera (roll, pitch,
+    yaw, x, y, z). ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
     ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step.
     """
 
@@ -109,7 +108,6 @@ class CloudsOutcome:
     verification: str
     circles: tuple[CircleRow, ...]
     table1_camera: Array
-    table1_flange: Array
     sights: tuple[SightRow, ...]
     path: Array
     path_true: Array
@@ -189,7 +187,7 @@ def study_clouds(
         progress("repeating circles", 0.2 + 0.2 * k / len(ids))
         rows.append(_circle_row(material, id, R_BC, seed))
     progress("registrations", 0.4)
-    camera, flange = _table1(material, ids)
+    camera = _table1(material, ids)
     sights = _sights(material, held)
     path, path_true = [], []
     for r in range(orders):
@@ -216,7 +214,6 @@ def study_clouds(
         verification=held,
         circles=tuple(rows),
         table1_camera=camera,
-        table1_flange=flange,
         sights=sights,
         path=np.array(path),
         path_true=np.array(path_true),
@@ -302,14 +299,9 @@ def see_halves(face: Array, half: NDArray[np.bool_], standard: FlangeStandard) -
     return fit_flange(face[half], standard).center_C, fit_flange(face[~half], standard).center_C
 
 
-def _table1(material: Material, ids: list[str]) -> tuple[Array, Array]:
-    camera, flange = [], []
-    for id in ids:
-        X = all_pairs([o for o in material.circles if o.id != id])
-        error = material.verifier(id, "algorithm1")(X)
-        camera.append(error.value)
-        flange.append(at_flange(error, X, material.data.poses[id]))
-    return np.array(camera), np.array(flange)
+def _table1(material: Material, ids: list[str]) -> Array:
+    fits = {id: all_pairs([o for o in material.circles if o.id != id]) for id in ids}
+    return np.array([material.verifier(id, "algorithm1")(X).value for id, X in fits.items()])
 
 
 def _sights(material: Material, held: str) -> tuple[SightRow, ...]:

@@ -62,7 +62,6 @@ class PairsOutcome:
     runs: StoredRuns | None
     own_pool: Array
     true: Array
-    run_medians: Array
     matched: int
     svd: Array
     ours: Array
@@ -93,7 +92,7 @@ def study_pairs(
     good = [o for o, keep in zip(pairs, estimate.inliers, strict=True) if keep]
     outliers = tuple(o.id for o, keep in zip(pairs, estimate.inliers, strict=True) if not keep)
     named = set(outliers)
-    table1, own, true, medians = None, [np.zeros(0)], [np.zeros(0)], []
+    table1, own, true = None, [np.zeros(0)], [np.zeros(0)]
     matched = 0
     if runs is not None:
         e = all_pairs(pairs).InvertAndCompose(runs.X_BC_implied)
@@ -107,7 +106,6 @@ def study_pairs(
             scored = np.array([o.id not in named for o in pairs])
             own.append(errors[inside])
             true.append(errors[~inside & scored])
-            medians.append(float(np.median(true[-1])))
     # the SVD has no look for outliers: it is trained on them too, as Table 1 was
     svd = _svd_folds(pairs, good, repeats, seed)
     ours = k_fold(good, folds=min(5, len(good)), repeats=repeats, seed=seed)
@@ -120,7 +118,6 @@ def study_pairs(
         runs=runs,
         own_pool=np.concatenate(own),
         true=np.concatenate(true),
-        run_medians=np.array(medians),
         matched=matched,
         svd=svd,
         ours=ours[np.isfinite(ours)],

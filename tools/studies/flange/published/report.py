@@ -44,7 +44,6 @@ class PublishedResults:
             "notes": self.notes,
             "simulation": {
                 "std_ratio_all_over_algorithm1": dict(zip(axes, sim.ratio, strict=True)),
-                "std_ratio_best_of_three": dict(zip(axes, sim.best_ratio, strict=True)),
                 "at_1mm": {name: _errors(e) for name, e in sim.costs.items()},
             },
             "paper_table1": {name: {"xyz_mm": v[:3], "rpy_deg": v[3:]} for name, v in TABLE1.items()},

@@ -54,8 +54,7 @@ class Simulation:
     """Standard deviations and means (L, 6) at ``levels_m`` (L,) noise.
 
     Of all pairs and of Algorithm 1 judged by the truth (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10)
-    with ``history_tcp`` (75 - 3, K) m, the mean true error; ``costs`` at 1 mm, by name of COSTS; ``best_of_three``
-    the best, by the truth, of three shuffled runs at 1 mm.
+    with ``history_tcp`` (75 - 3, K) m, the mean true error; ``costs`` at 1 mm, by name of COSTS.
     """
 
     levels_m: Array
@@ -66,12 +65,6 @@ class Simulation:
     history: Array
     history_tcp: Array
     costs: dict[str, Errors]
-    best_of_three: Errors
-
-    @property
-    def best_ratio(self) -> Array:
-        """All pairs over the best of three shuffled runs of Algorithm 1 (6,), standard deviations, at 1 mm."""
-        return np.asarray(self.costs["all"].e.std(axis=0) / self.best_of_three.e.std(axis=0))
 
     @property
     def ratio(self) -> Array:
@@ -169,13 +162,6 @@ def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progre
     R, t, steps = algorithm1_batch(p_B, p_C, orders, by_truth, keep_history=True)
     path = [errors_of(Rk, tk, p_B) for Rk, tk in steps]
     costs = {"truth": errors_of(R, t, p_B), "all": errors_of(*_all_pairs(p_B, p_C), p_B)}
-    three = [(R, t)]
-    for _ in range(2):
-        R, t, _ = algorithm1_batch(p_B, p_C, _orders(realisations, len(p_B), rng), by_truth)
-        three.append((R, t))
-    chosen = np.argmin([by_truth(*run) for run in three], axis=0)
-    R_three, t_three = (np.array([run[k] for run in three])[chosen, np.arange(realisations)] for k in (0, 1))
-    best_of_three = errors_of(R_three, t_three, p_B)
     R_v, t_v = _measured_camera(realisations, 1e-3, rng)
 
     def by_verification(R: Array, t: Array) -> Array:
@@ -202,7 +188,6 @@ def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progre
         history=np.array([x.e for x in path]),
         history_tcp=np.array([x.at_tcp.mean(axis=1) for x in path]),
         costs={name: costs[name] for name in COSTS},
-        best_of_three=best_of_three,
     )
 
 
