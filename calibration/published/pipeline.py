@@ -20,16 +20,12 @@ _BLOCK = 64  # circles judged at once: keeps the distances of a 20 000-point fac
 
 @dataclass(frozen=True)
 class CircleParameters:
-    """Section 3.2.2: R = 31 mm, e_d = 0.3 mm, e_r = 1 mm, k_max = 10 000; m.
-
-    ``only_smaller`` is the authors' program, which takes radii from R - e_r to R, where the text says a tolerance.
-    """
+    """Section 3.2.2: R = 31 mm, e_d = 0.3 mm, e_r = 1 mm, k_max = 10 000; m."""
 
     R: float = 0.031
     e_d: float = 0.0003
     e_r: float = 0.001
     k_max: int = 10_000
-    only_smaller: bool = False
 
     def __post_init__(self) -> None:
         if not (0.0 < self.e_r < self.R and self.e_d > 0.0 and self.k_max > 0):
@@ -66,7 +62,7 @@ def search_circle(points_C: Array, parameters: CircleParameters | None = None, *
     rng = np.random.default_rng(seed)
     triples = points[rng.integers(len(points), size=(p.k_max, SAMPLE_SIZE))]
     centers, radii = circumcircles(triples)
-    smallest, largest = p.R - p.e_r, p.R if p.only_smaller else p.R + p.e_r
+    smallest, largest = p.R - p.e_r, p.R + p.e_r
     good = np.isfinite(radii) & (radii >= smallest) & (radii <= largest)
     centers, radii = centers[good], radii[good]
     if len(radii) == 0:

@@ -25,6 +25,6 @@ def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def mappings_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
-    """Mappings, one line each: these keys, or those of the first."""
-    columns = columns or list(rows[0])
+    """Mappings, one line each: these keys, or all."""
+    columns = columns or list(dict.fromkeys(key for row in rows for key in row))
     return csv_text(columns, ([row.get(name, "") for name in columns] for row in rows))

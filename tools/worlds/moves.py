@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import difference, exp_rotation, fit_rigid, inverse, rotation_vector, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, inverse, rotation_vector
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
 from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves
 from weldcal.calibration.motion.observed import ObservedFrames
@@ -132,39 +132,6 @@ class TargetInHand:
     def at(self, t: Array) -> Array:
         """Target poses X_FT (..., 4, 4) at times (...) s, exact."""
         return np.asarray(inverse(self.moves.at(t)) @ self.X_BT.GetAsMatrix4())
-
-
-def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: RigidTransform) -> Array:
-    """Errors (7,) of X_BC's six and of the clock's offset in sigmas, by least squares with the true motion and noise.
-
-    The capture times (N,) s are known but for an offset and a drift, as those of a device are. An estimator can do no
-    better, so that what this differs from the normal law by is the draw.
-    """
-    X = moves.at(capture)
-    rate = (moves.at(capture + _STEP_S) - moves.at(capture - _STEP_S)) / (2.0 * _STEP_S)
-    p, n = X[:, :3, 3], X[:, :3, 2]
-    A = _axes(n)[:, :, :2]
-    At = np.swapaxes(A, 1, 2)
-    g = np.concatenate([rate[:, :3, 3], np.einsum("nij,nj->ni", At, rate[:, :3, 2])], axis=1)
-    found = X_BC
-    N = np.eye(8)
-    offset = 0.0
-    for _ in range(_ROUNDS):
-        R, t = found.rotation().matrix(), np.asarray(found.translation())
-        y = np.concatenate([frames.p_C @ R.T + t - p, np.einsum("nij,nj->ni", At, frames.n_C @ R.T - n)], axis=1)
-        J = np.zeros((len(capture), 5, 8))
-        J[:, :3, :3], J[:, :3, 3:6] = -skew(frames.p_C @ R.T), np.eye(3)
-        J[:, 3:, :3] = -At @ skew(frames.n_C @ R.T)
-        J[:, :, 6], J[:, :, 7] = -g, -g * (capture - capture.mean())[:, None]
-        W = np.zeros((len(capture), 5, 5))
-        W[:, :3, :3] = np.linalg.inv(R @ frames.covariance @ R.T)
-        W[:, 3, 3] = W[:, 4, 4] = 1.0 / frames.normal_sigma**2
-        N = np.einsum("nia,nij,njb->ab", J, W, J)
-        step = -np.linalg.solve(N, np.einsum("nia,nij,nj->a", J, W, y))
-        turn = RotationMatrix.ProjectToRotationMatrix(exp_rotation(step[:3]) @ R)
-        found, offset = RigidTransform(turn, t + step[3:6]), float(step[6])
-    error = np.append(-difference(found.GetAsMatrix4(), X_BC.GetAsMatrix4()), offset)
-    return np.asarray(error / np.sqrt(np.diag(np.linalg.inv(N))[:7]))
 
 
 _CENTER = np.array([-0.65, -0.25, 0.45])  # of the work, in B

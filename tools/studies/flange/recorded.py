@@ -21,12 +21,11 @@ from weldcal.calibration.eye_on_base.validation import mean_interval, position_e
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.local_field import choose_local
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import fixed, statistics
 from weldcal.tools.studies.harness import Figures, Row, Study
 
@@ -163,23 +162,20 @@ LEAST_HALVES = 16
 correction."""
 
 
-def study_halves(
-    folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
-) -> dict[str, Any]:
+def study_halves(folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress) -> dict[str, Any]:
     """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others.
 
     Deterministic for ``seed``.
 
-    ``local``: from two thirds, with the choice of a local field (--refine local). Returns means of the stated held-out
-    error and of the error on the other half (mm), how many of the latter lie in the interval (95 %) that the first half
-    states, and how many halves fixed no calibration (``skipped``).
+    Returns means of the stated held-out error and of the error on the other half (mm), how many of the latter lie in
+    the interval (95 %) that the first half states, and how many halves fixed no calibration (``skipped``).
 
     Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
     """
     good, patterns, _ = usable_scans(
         folder, LEAST_HALVES, f"Halves need {LEAST_HALVES} usable scans and more", seed, progress, 0.1
     )
-    half, rows, skipped = 2 * len(good) // 3 if local else len(good) // 2, [], 0
+    half, rows, skipped = len(good) // 2, [], 0
     for k in range(draws):
         progress("halves", 0.1 + 0.9 * k / draws)
         order = np.random.default_rng([seed, k]).permutation(len(good))
@@ -187,14 +183,8 @@ def study_halves(
         try:
             X_BC, correction = solve_jointly(ours, patterns, seed=seed)
             new_scans = [corrected_observation(correction, o) for o in others]
-            if local:
-                choice = choose_local(ours, patterns, X_BC, correction, seed=seed)
-                errors = choice.local_m if choice.accepted else choice.plain_m
-                new_scans = choice.field.applied(X_BC, new_scans) if choice.accepted else new_scans
-            else:
-                errors = estimate_jointly(ours, patterns, config=SolveConfig(seed=seed, allow_coplanar=True))[
-                    0
-                ].held_out.position_m
+            config = SolveConfig(seed=seed, allow_coplanar=True)
+            errors = estimate_jointly(ours, patterns, config=config)[0].held_out.position_m
         except InputError:
             skipped += 1
             continue
@@ -267,13 +257,10 @@ def halves(
     call: Call,
     dataset: DatasetArgument,
     draws: Annotated[int, option("--draws", "N", "Number of random halves.", min=1)] = 20,
-    local: Annotated[
-        bool, switch("--local", "Calibrate from two thirds with --refine local, and judge it on the others.")
-    ] = False,
 ) -> Outcome:
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the
     other half."""
-    folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
+    folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress)
     return HALVES.found(found, folder)
 
 

@@ -4,7 +4,6 @@ Frames are rendered beforehand and replayed at the scanner's rate on the wall cl
 process are the cell's own; the arm's control is a simulated arm at 500 Hz in the same Diagram.
 """
 
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -49,7 +48,7 @@ from weldcal.tools.report.files import write_json
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, Target, all_met, print_targets, whole
 from weldcal.tools.studies.motion.drift import benchmark_drift
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
-from weldcal.tools.worlds.moves import DELAY_S, cube_moves, exact_errors, observed_frames
+from weldcal.tools.worlds.moves import DELAY_S, cube_moves, observed_frames
 
 LEVEL, SIGMAS = 0.95, 1.959964
 WORK_M = 0.75  # from the scanner to the middle of the cube
@@ -67,8 +66,7 @@ def one_run(
     Returns:
         errors (7,) of X_BC's six and the clock's offset (rad, m, s), the same in sigmas, the NEES of X_BC over its six,
         the error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
-        middle of the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit
-        that knows the motion exactly: what the draws themselves are.
+        middle of the work (mm), the turn (deg).
     """
     device, linear = clock == "device", index % 2 == 1
     rng = np.random.default_rng([seed, index, int(device)])
@@ -98,7 +96,6 @@ def one_run(
         "own_ms": 1e3 * (stated.offset_s - own),
         "work_mm": 1e3 * float(np.linalg.norm(np.asarray(found.X_BC @ p) - np.asarray(X_BC @ p))),
         "turn_deg": float(np.degrees(np.linalg.norm(error[:3]))),
-        "exact": exact_errors(frames, capture, moves, X_BC) if device else None,
         "duration_s": duration_s,
     }
 
@@ -121,7 +118,6 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
     of = {
         key: np.array([r[key] for r in runs]) for key in ("errors", "scaled", "nees", "own_ms", "work_mm", "turn_deg")
     }
-    exact = None if runs[0]["exact"] is None else np.array([r["exact"] for r in runs])
     offset = 1e3 * of["errors"][:, 6]
     low, high = (binom.ppf(q, len(offset), LEVEL) / len(offset) for q in (0.005, 0.995))
     return {
@@ -135,8 +131,6 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "offset_own_mean_worst_ms": float(np.abs(of["own_ms"]).max()),
         "nees": float(of["nees"].mean()),
         "nees_per_unknown": [float(v) for v in (of["scaled"] ** 2).mean(axis=0)],
-        "nees_per_unknown_of_exact_fits": None if exact is None else [float(v) for v in (exact**2).mean(axis=0)],
-        "offset_coverage_of_exact_fits": None if exact is None else float((np.abs(exact[:, 6]) < SIGMAS).mean()),
         "nees_per_unknown_chance": [float(chi2.ppf(q, len(offset)) / len(offset)) for q in (0.005, 0.995)],
         "work_p95_mm": float(np.percentile(of["work_mm"], 95)),
         "work_worst_mm": float(of["work_mm"].max()),
@@ -272,14 +266,12 @@ def _row(w: DriftHistory) -> dict[str, float]:
         "rms_mm": 1e3 * w.rms_m,
         "mean_mm": 1e3 * float(np.linalg.norm(e.mean(axis=0))),
         "spread_mm": 1e3 * float(np.sqrt(e.var(axis=0).sum())),
-        "tilt_spread_deg": float(np.degrees(np.sqrt(w.tilts[used].var(axis=0).mean()))),
     }
 
 
 _POLL_S = 0.004
 _STEP_S = 0.004
 _FPS, _MEDIAN_MS = 20.0, 50.0
-_PAPER = "10 million points per second arrive; real-time processing is left to powerful hardware (section 4.4)"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -297,7 +289,6 @@ class Throughput:
     dropped: int
     wait_ms: tuple[float, ...]
     behind_ms: tuple[float, ...]
-    load_average: float  # of the computer meanwhile, over a minute
 
     @property
     def fps(self) -> float:
@@ -327,10 +318,6 @@ class Throughput:
             "dropped": self.dropped,
             "arrival_to_estimate_ms": {"median": float(p[0]), "p95": float(p[1]), "worst": float(p[2])},
             "loop_behind_ms": {"median": float(np.median(self.behind_ms)), "worst": float(max(self.behind_ms))},
-            "load_average": self.load_average,
-            "cores": os.cpu_count(),
-            "points_per_second": self.pixels * self.fps,
-            "paper": _PAPER,
             "targets": [{"what": t.what, "reached": t.value, "wanted": t.wanted, "met": t.met} for t in self.targets],
         }
 
@@ -439,7 +426,6 @@ def _replayed(
         dropped=dropped,
         wait_ms=tuple(waits),
         behind_ms=tuple(behind),
-        load_average=os.getloadavg()[0],
     )
 
 

@@ -33,19 +33,6 @@ from weldcal.welding.locate.planes import Floats
 
 SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
 FIRST_HELD_OUT = 1000  # seeds from here on were not used while the figures of the algorithms were set
-COLUMNS = (
-    "preset",
-    "method",
-    "shape",
-    "seed",
-    "refused",
-    "rms_mm",
-    "worst_mm",
-    "sigma_mm",
-    "chi",
-    "within_2_sigma",
-    "seconds",
-)
 JUDGED = ("rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma")
 Plan = dict[str, Any]
 """The plan of one scan by one method: lengths in mm, NaN where it was refused; processor seconds."""
@@ -130,18 +117,6 @@ def error_text(planned: Sequence[Plan]) -> str:
 
 
 PRESET = "phoxi_m"
-TROUBLE_COLUMNS = (
-    "name",
-    "method",
-    "seed",
-    "refused",
-    "rms_mm",
-    "worst_mm",
-    "sigma_mm",
-    "within_2_sigma",
-    "ok",
-    "seconds",
-)
 
 
 def trouble_trial(trouble: Trouble, seed: int) -> Plan:
@@ -182,11 +157,11 @@ def run_seam_planning_benchmark(
                 for method, plan in METHODS.items():
                     trials.append({**named, "method": method, **figures(partial(plan, scene))})
                 progress("planning", len(trials) / (len(METHODS) * total))
-                write_atomic(out / "trials.csv", mappings_csv(trials, COLUMNS))
+                write_atomic(out / "trials.csv", mappings_csv(trials))
     rows = plan_rows(trials, "preset")
     if troubles:
         cases = [trouble_trial(trouble, FIRST_HELD_OUT + seed + k) for trouble in TROUBLES for k in range(runs)]
-        write_atomic(out / "troubles.csv", mappings_csv(cases, TROUBLE_COLUMNS))
+        write_atomic(out / "troubles.csv", mappings_csv(cases))
         rows |= plan_rows(cases, "name")
     done = [t for t in trials if not t["refused"]]
     summary: dict[str, object] = {

@@ -35,20 +35,6 @@ NEES_BOUND = float(chi2.ppf(0.9973, 6))  # of a pose within 3 sigma
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.3, 0.8
 SAME_SURFACE_M = 1e-4
 HINT_M, HINT_RAD = 0.04, math.radians(15.0)
-COLUMNS = (
-    "kind",
-    "part",
-    "seed",
-    "verdict",
-    "nees",
-    "drawn_mean_mm",
-    "drawn_max_mm",
-    "seam_mean_mm",
-    "seam_max_mm",
-    "measured",
-    "cpu_s",
-    "sentence",
-)
 SCENES: dict[str, Mapping[str, object]] = {
     "clutter": {"objects": 8, "fingers": 2},
     "missing faces": {"objects": 6, "fingers": 1, "spots": 4},
@@ -75,7 +61,7 @@ def plan_trials(seeds: Sequence[int], names: Sequence[str]) -> list[Trial]:
 
 
 def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
-    """Scan, register and judge; a row of COLUMNS."""
+    """Scan, register and judge; a row of the table."""
     part = subject(name)
     scanner = get_scanner("phoxi_m", 824)
     number = 1000 * list(PARTS).index(name) + seed
@@ -139,7 +125,7 @@ def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float
 
 
 def run_refusal(name: str, seed: int) -> dict[str, object]:
-    """A subject that must be refused: right when it is, by the error and the words that name why; a row of COLUMNS."""
+    """A subject that must be refused: right when it is, by the error and the words that name why."""
     case = REFUSALS[name]()
     scene = scan_scene(
         case.there, get_scanner("phoxi_m", 824), 50_000 + seed, objects=3, fingers=0, spread_m=0.02, twice=case.twice
@@ -175,7 +161,7 @@ def run_registration_study(
     rows: list[dict[str, object]] = []
     for k, job in enumerate(jobs):
         rows.append(job())
-        write_atomic(out / "registrations.csv", mappings_csv(rows, COLUMNS))
+        write_atomic(out / "registrations.csv", mappings_csv(rows))
         progress(f"{rows[-1]['kind']}: {rows[-1]['part']}", (k + 1) / len(jobs))
     return _summed(rows)
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated
 
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
@@ -18,33 +18,6 @@ from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
 from weldcal.tools.worlds.robot.fault_run import FaultOutcome, FaultSequence, run_case, run_sequence
-
-OUTCOME_COLUMNS = (
-    "name",
-    "must",
-    "did",
-    "fault",
-    "rest_after_ms",
-    "travel_mm",
-    "seen_after_ms",
-    "sentence",
-    "played",
-    "problems",
-    "retries",
-)
-SEQUENCE_COLUMNS = (
-    "seed",
-    "seconds",
-    "starts",
-    "starts_refused",
-    "moves_without_a_command",
-    "moves_after_a_fault",
-    "unattended_s",
-    "unseen",
-    "unasked_stops",
-    "thrown",
-    "reported",
-)
 
 
 @dataclass(frozen=True)
@@ -85,7 +58,8 @@ def _spread(values: Sequence[float | None]) -> dict[str, float]:
     return statistics(found, "median", "max") if found else {}
 
 
-def _table(columns: tuple[str, ...], rows: Sequence[object]) -> str:
+def _table(kind: type[FaultOutcome] | type[FaultSequence], rows: Sequence[object]) -> str:
+    columns = [field.name for field in fields(kind)]
     return csv_text(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
@@ -122,12 +96,12 @@ def faults(
         for k, case in enumerate(cases):  # each must be able to start after the one before
             call.progress(case.name, share * k / len(cases))
             report.outcomes.append(run_case(bench, case, hasty=False))
-            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
+            write_atomic(out / "faults.csv", _table(FaultOutcome, report.outcomes))
     for k in range(sequences):
         call.progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
         with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
             report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
-        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
+        write_atomic(out / "sequences.csv", _table(FaultSequence, report.sequences))
     write_json(out / "robot_faults.json", report.summary())
     return Printed(report.summary(), rows={outcome.name: outcome.line for outcome in report.outcomes})
 

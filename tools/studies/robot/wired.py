@@ -30,12 +30,6 @@ FAULTY = 0.75
 WARM_UP_SHARE = 1 / 3
 FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
 FEWEST, SHORTEST_H = 5, 0.25  # cycles and hours for a slope: within minutes what is loaded late looks like growth
-COLUMNS = (
-    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s",
-    "named_after_s", "wall_s", "moved",
-    "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "in_use_mb", "world_mb",
-    "scanner_mb", "finger_mb",
-)  # fmt: skip
 PROCESSES = ("cell", "world", "scanner", "finger")
 # Of the cell's memory: what C library and Python have given out, and not what they keep for the next allocation
 IN_USE = "in_use"
@@ -70,7 +64,7 @@ def run_soak(
                     "problems": [str(problem)],
                 }
             rows.append(row | _processes(world))
-            write_atomic(folder / "cycles.csv", mappings_csv(rows, COLUMNS))
+            write_atomic(folder / "cycles.csv", mappings_csv(rows))
             if not _alive(world.process.pid):
                 break
         world_lives = _alive(world.process.pid)
@@ -246,25 +240,11 @@ def soak(
     return Outcome(summary, text=table)
 
 
-FAULT_COLUMNS = (
-    "device",
-    "fault",
-    "phase",
-    "state",
-    "reason",
-    "torch_off_after_s",
-    "rest_after_s",
-    "named_after_s",
-    "moved",
-    "arc_s",
-    "wall_s",
-    "problems",
-)
 TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
 
 
 def one_world(device: str, phase: str, seed: int, folder: str) -> Mapping[str, object]:
-    """Return every fault of a device in a phase, one job each, in one world: rows of FAULT_COLUMNS."""
+    """Return every fault of a device in a phase, one job each, in one world."""
     host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     with wired_world(Path(folder) / "world", host, seed, SEAM_MM, bridged=True) as world:
         return {"rows": [_row(world, Path(folder), seed, Happening(device, fault, phase)) for fault in FAULTS]}
@@ -275,7 +255,8 @@ def _row(world: WiredWorld, folder: Path, seed: int, happening: Happening) -> di
     try:
         return run_job(world, folder / happening.fault, seed, calibrates=calibrates, happening=happening)
     except WeldcalError as problem:  # the job did not begin: what the fault before it has left
-        return dict.fromkeys(FAULT_COLUMNS, "") | dc.asdict(happening) | {"state": "failed", "problems": [str(problem)]}
+        said = str(problem)
+        return dc.asdict(happening) | {"state": "failed", "reason": said, "problems": [said]}
 
 
 def fault_cases(folder: Path, seed: int, devices: Sequence[str] = (), phases: Sequence[str] = ()) -> Cases:
@@ -316,7 +297,7 @@ def _faults(found: Results) -> Figures:
 
 def _fault_rows(figures: Figures) -> Iterable[Row]:
     for r in figures["rows"]:
-        times = (_seconds(r[name]) for name in TIMES)
+        times = (_seconds(r.get(name)) for name in TIMES)
         verdict = "; ".join(r["problems"]) or "as required"
         yield str(r["device"]), str(r["fault"]), str(r["phase"]), str(r["state"]), *times, verdict, str(r["reason"])
 
@@ -352,5 +333,5 @@ def wired_faults(
     found = WIRED_FAULTS.run(
         Farm.of(folder, call.given, call.progress), fault_cases(folder, call.seed, devices or (), phases or ())
     )
-    write_atomic(folder / "faults.csv", mappings_csv(found.figures["rows"], FAULT_COLUMNS))
+    write_atomic(folder / "faults.csv", mappings_csv(found.figures["rows"]))
     return Outcome(found.figures, text=found.markdown())

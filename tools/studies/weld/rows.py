@@ -46,17 +46,6 @@ _BOUNDED = (MetricTarget("omega_rad_s", 0.8, unit="rad/s"), MetricTarget("tip_sp
 _GAP_10, _GAP_25 = ((0.145, 0.155),), ((0.1375, 0.1625),)
 
 _WRONG = (MetricTarget("mean_mm", 0.10, "mean"), MetricTarget("max_mm", 0.30), MetricTarget("height_mm", 0.65))
-_SINGLE = {
-    "stamp_bias": "only: pictures stamped 10 ms early, poses 8 ms late",
-    "stamp_jitter": "only: each stamp off by 2 ms (one sigma)",
-    "wedge_open": "only: both walls 0.75 deg farther open",
-    "wedge_side": "only: both walls turned by 0.75 deg to the left",
-    "wear": "only: tip worn by 0.1 mm of radius",
-    "seat": "only: tip sits 0.1 mm higher than believed",
-    "lag_half": "only: robot's lag half of the believed 25 ms",
-    "lag_1_5": "only: robot's lag 1.5 times as long",
-    "lag_double": "only: robot's lag twice as long",
-}
 
 ROWS: tuple[Row, ...] = (
     Row(
@@ -75,10 +64,6 @@ ROWS: tuple[Row, ...] = (
             MetricTarget("height_mm", 0.65),
             *_BOUNDED,
         ),
-    ),
-    *(
-        Row(name, f"S R60, L R20; {label}", tuple(WeldCase(seam, name) for seam in ("s_r60", "l_r20_convex")), _WRONG)
-        for name, label in _SINGLE.items()
     ),
     Row(
         "nominal",
@@ -152,15 +137,6 @@ ROWS: tuple[Row, ...] = (
             MetricTarget("work_deg", 3.0, unit="deg"),
             MetricTarget("travel_error_deg", 0.1, unit="deg"),
         ),
-    ),
-    *(
-        Row(
-            f"space_{um}um",
-            f"the same L on R 300 mm, tag noise {um} um: what of the error is noise",
-            (WeldCase("l_r20_on_r300", f"kinematic_{um}um"),),
-            (MetricTarget("space_mm", 0.03),),
-        )
-        for um in (0, 5, 10)
     ),
 )
 

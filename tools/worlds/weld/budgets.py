@@ -143,7 +143,6 @@ PERFECT = Budget(
     plan_noise_m=0.0,
 )
 KINEMATIC = replace(PERFECT, name="kinematic", lag_s=0.020, tag_sigma_m=0.02e-3)
-QUIETER = tuple(replace(KINEMATIC, name=f"kinematic_{um}um", tag_sigma_m=1e-6 * um) for um in (0, 5, 10))
 
 # docs/weld_law.md, section 9, says where each size comes from.
 _WALL = math.radians(0.75)
@@ -165,18 +164,14 @@ IMPERFECT = replace(
 SINGLE = tuple(
     replace(NOMINAL, name=name, unknown=unknown)
     for name, unknown in (
-        ("stamp_bias", Unknowns(image_bias_s=(-0.010, -0.010), pose_bias_s=(0.008, 0.008))),
-        ("stamp_jitter", Unknowns(image_jitter_s=(0.002, 0.002), pose_jitter_s=(0.002, 0.002))),
         ("wedge_open", Unknowns(left_wall_rad=(_WALL, _WALL), right_wall_rad=(_WALL, _WALL))),
         ("wedge_side", Unknowns(left_wall_rad=(_WALL, _WALL), right_wall_rad=(-_WALL, -_WALL))),
         ("wear", Unknowns(wear_m=(0.1e-3, 0.1e-3))),
         ("seat", Unknowns(seat_m=(0.1e-3, 0.1e-3))),
-        ("lag_half", Unknowns(lag_share=(0.5, 0.5))),
-        ("lag_1_5", Unknowns(lag_share=(1.5, 1.5))),
         ("lag_double", Unknowns(lag_share=(2.0, 2.0))),
     )
 )
-BUDGETS = {b.name: b for b in (NOMINAL, IMPERFECT, *SINGLE, HARD, KINEMATIC, *QUIETER, PERFECT)}
+BUDGETS = {b.name: b for b in (NOMINAL, IMPERFECT, *SINGLE, HARD, KINEMATIC, PERFECT)}
 
 
 def planned_seam(seam: TrueSeam, budget: Budget, rng: np.random.Generator) -> SeamCurve:

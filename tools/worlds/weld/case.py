@@ -234,7 +234,6 @@ class CellRun:
     completed: bool
     reason: str
     point_sd_mm: float = np.nan
-    point_spread_mm: float = np.nan
     point_offset_mm: float = np.nan
     height_sd_mm: float = np.nan
     height_offset_mm: float = np.nan
@@ -242,7 +241,6 @@ class CellRun:
     torch_max_mm: float = np.nan
     space_max_mm: float = np.nan
     cv_percent: float = np.nan
-    welded_mm: float = np.nan
     real_time_factor: float = np.nan
     cpu_per_second: float = np.nan
 
@@ -260,7 +258,6 @@ def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: 
         completed=not run.held,
         reason=run.reason or "",
         point_sd_mm=1e3 * scatter(felt.lateral),
-        point_spread_mm=1e3 * float(felt.lateral.std()),
         point_offset_mm=1e3 * float(felt.lateral.mean()),
         height_sd_mm=1e3 * scatter(felt.height),
         height_offset_mm=1e3 * float(felt.height.mean()),
@@ -268,7 +265,6 @@ def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: 
         torch_max_mm=1e3 * weld.error.max_m,
         space_max_mm=1e3 * float(np.hypot(weld.error.lateral, weld.error.height).max()),
         cv_percent=1e2 * weld.speed.cv,
-        welded_mm=1e3 * weld.speed.welded_m,
         real_time_factor=run.real_time_factor("weld"),
         cpu_per_second=cpu_per_second,
     )
