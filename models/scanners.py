@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 LARGEST_PX = 8192
 
 
+Floats = npt.NDArray[np.float64]
+
+
 @dataclass(kw_only=True)
 class NoisePart:
     """What differs from scan to scan."""
@@ -90,8 +93,8 @@ class ScannerPart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadScanner:
-    """A scanner file in pixels and metres."""
+class ScannerPreset:
+    """A scanner: image size and intrinsics in pixels (OpenCV convention), working range in metres, and its noise."""
 
     name: str
     width: int
@@ -105,8 +108,38 @@ class ReadScanner:
     optimum_m: float
     noise: DepthNoise
 
+    @property
+    def K(self) -> Floats:
+        """(3,3) OpenCV camera matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-def read_scanner_file(path: Path) -> ReadScanner:
+    def footprint_m(self, distance_m: float) -> tuple[float, float]:
+        """Width and height of the scanned area on a plane at that distance, m."""
+        return self.width * distance_m / self.fx, self.height * distance_m / self.fy
+
+    def measured(self, points_C: Floats) -> Floats:
+        """Where the device's own errors, without noise, put points (..., 3) m of its camera frame."""
+        return measured_points(points_C, self.noise, (self.fx, self.fy, self.cx, self.cy, self.width, self.height))
+
+    def resized(self, width: int, height: int | None = None) -> ScannerPreset:
+        """Return the same view in another resolution; the image corners, not the pixel centres, stay where they are."""
+        height = round(self.height * width / self.width) if height is None else height
+        if width < 8 or height < 8:
+            raise InputError("A scanner image needs at least 8 x 8 pixels: ask for a larger width and height.")
+        su, sv = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * su,
+            fy=self.fy * sv,
+            cx=(self.cx + 0.5) * su - 0.5,
+            cy=(self.cy + 0.5) * sv - 0.5,
+            noise=replace(self.noise, correlation_px=self.noise.correlation_px * su),
+        )
+
+
+def read_scanner_file(path: Path) -> ScannerPreset:
     """Return the scanner of a file.
 
     Raises:
@@ -118,7 +151,7 @@ def read_scanner_file(path: Path) -> ReadScanner:
 
 
 @lru_cache(maxsize=8)
-def _read(path: Path, changed: int) -> ReadScanner:
+def _read(path: Path, changed: int) -> ScannerPreset:
     part, file = read_part(ScannerPart, read_document(path), path.name), path.name
     if not (8 <= part.width <= LARGEST_PX and 8 <= part.height <= LARGEST_PX):
         raise InputError(
@@ -169,7 +202,7 @@ def _read(path: Path, changed: int) -> ReadScanner:
     except InputError as error:
         raise InputError(f"'{file}': {error}") from error
     near, far = part.near_mm / 1e3, part.far_mm / 1e3
-    return ReadScanner(
+    return ScannerPreset(
         name=part.name or path.stem,
         width=part.width,
         height=part.height,
@@ -182,56 +215,6 @@ def _read(path: Path, changed: int) -> ReadScanner:
         optimum_m=optimum / 1e3,
         noise=noise,
     )
-
-
-Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScannerPreset:
-    """A scanner: image size and intrinsics in pixels (OpenCV convention), working range in metres, and its noise."""
-
-    name: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    near_m: float
-    far_m: float
-    optimum_m: float
-    noise: DepthNoise
-
-    @property
-    def K(self) -> Floats:
-        """(3,3) OpenCV camera matrix."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-    def footprint_m(self, distance_m: float) -> tuple[float, float]:
-        """Width and height of the scanned area on a plane at that distance, m."""
-        return self.width * distance_m / self.fx, self.height * distance_m / self.fy
-
-    def measured(self, points_C: Floats) -> Floats:
-        """Where the device's own errors, without noise, put points (..., 3) m of its camera frame."""
-        return measured_points(points_C, self.noise, (self.fx, self.fy, self.cx, self.cy, self.width, self.height))
-
-    def resized(self, width: int, height: int | None = None) -> ScannerPreset:
-        """Return the same view in another resolution; the image corners, not the pixel centres, stay where they are."""
-        height = round(self.height * width / self.width) if height is None else height
-        if width < 8 or height < 8:
-            raise InputError("A scanner image needs at least 8 x 8 pixels: ask for a larger width and height.")
-        su, sv = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * su,
-            fy=self.fy * sv,
-            cx=(self.cx + 0.5) * su - 0.5,
-            cy=(self.cy + 0.5) * sv - 0.5,
-            noise=replace(self.noise, correlation_px=self.noise.correlation_px * su),
-        )
 
 
 @dataclass(frozen=True)
@@ -344,7 +327,7 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
     Raises InputError that names the known scanners, or what is wrong in the file.
     """
     if is_scanner_file(name):
-        preset: ScannerPreset | None = ScannerPreset(**vars(read_scanner_file(Path(name))))
+        preset: ScannerPreset | None = read_scanner_file(Path(name))
     else:
         preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
     if preset is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,43 +106,26 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
 def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Facts:
     """Steps and limits of the jobs besides the weld; a job of another package has none."""
     job, c = cell.job, cell.scenario.calibration
+    facts = partial(Facts, title=title, robot=robot, settable_pace=settable)
     if isinstance(job, AddedMounting):
-        scans = c.maximum_scans
-        return Facts(
-            title=title,
-            robot=robot,
-            settable_pace=settable,
+        return facts(
             steps=MOUNTING_STEPS,
             required_mm=c.required_error_mm,
-            maximum_scans=scans,
+            maximum_scans=c.maximum_scans,
             minimum_scans=c.minimum_scans,
         )
     if isinstance(job, AddedMotion):
-        watches = job.monitor is not None
-        steps = WATCH_STEPS if watches else MOTION_STEPS
-        return Facts(title=title, robot=robot, settable_pace=settable, steps=steps, maximum_scans=job.frames)
+        return facts(steps=MOTION_STEPS if job.monitor is None else WATCH_STEPS, maximum_scans=job.frames)
     if isinstance(job, AddedVisit):
-        return Facts(
-            title=title, robot=robot, settable_pace=settable, steps=TABLET_STEPS, maximum_scans=len(job.plan.q_above)
-        )
+        return facts(steps=TABLET_STEPS, maximum_scans=len(job.plan.q_above))
     if isinstance(job, AddedTouches):
         touch = cell.scenario.part(TouchConfig)
         press_mm = math.nan if touch is None else touch.press_mm
-        return Facts(
-            title=title,
-            robot=robot,
-            settable_pace=settable,
-            steps=TOUCH_STEPS,
-            maximum_scans=job.points,
-            press_mm=press_mm,
-            height=job.height_m,
-        )
+        return facts(steps=TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m)
     if isinstance(job, AddedProfilerJob):
         keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
-        return Facts(
-            title=title, robot=robot, settable_pace=settable, steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys)
-        )
-    return Facts(title=title, robot=robot, settable_pace=settable)
+        return facts(steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys))
+    return facts()
 
 
 def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:

@@ -46,23 +46,7 @@ FIGURES = (
     ("in space, largest mm", "space_max_mm", 3),
     ("torch speed CV %", "cv_percent", 2),
     ("real-time factor of the weld", "real_time_factor", 2),
-    ("CPU s per simulated s", "cpu_per_second", 2),
 )
-
-
-class PhaseCpu:
-    """Processor seconds of this process (all threads) by phase of a run; hand `progress` to whatever runs it."""
-
-    def __init__(self) -> None:
-        self._phase, self._since = "", time.process_time()
-        self.seconds: dict[str, float] = {}
-
-    def progress(self, stage: str, share: float) -> None:
-        """Count the time up to now for the phase that was running."""
-        now = time.process_time()
-        if stage != self._phase:
-            self.seconds[self._phase] = self.seconds.get(self._phase, 0.0) + now - self._since
-            self._phase, self._since = stage, now
 
 
 def cases(scenarios: Iterable[str], seeds: range, seam_mm: float | None = None, law: str = "guarded") -> Cases:
@@ -87,13 +71,9 @@ def weld_once(name: str, seed: int, seam_mm: float | None, law: str) -> Mapping[
     scenario: Scenario = known_camera(name)
     scenario.welding.seam_length_mm = seam_mm
     scenario.welding.law = law
-    watch = PhaseCpu()
-    run = run_cell(build_cell(scenario, seed), watch.progress)
-    watch.progress("", 1.0)
+    run = run_cell(build_cell(scenario, seed))
     result = measure(run, RunOptions(scenario=name, out=Path(), seed=seed, recording=False))
-    lasted = sum(b[1] - a[1] for a, b in zip(run.phases, run.phases[1:], strict=False) if a[0] == "weld")
-    cpu = watch.seconds.get("weld", np.nan) / lasted if lasted else np.nan
-    return vars(figures(result, name, law, seed, cpu))
+    return vars(figures(result, name, law, seed))
 
 
 def targets(runs: Iterable[Mapping[str, Any]]) -> dict[str, Target]:

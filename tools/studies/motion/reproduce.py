@@ -147,19 +147,7 @@ def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: 
     observed = seen.observed
     progress("calibration in motion", 0.76)
     found = estimate_in_motion(observed, motion)
-    by_arrival = estimate_in_motion(
-        ObservedFrames(
-            ids=observed.ids,
-            arrival=observed.arrival,
-            device=None,
-            p_C=observed.p_C,
-            n_C=observed.n_C,
-            covariance=observed.covariance,
-            normal_sigma=observed.normal_sigma,
-        ),
-        motion,
-        held_out=False,
-    )
+    by_arrival = estimate_in_motion(replace(observed, device=None), motion, held_out=False)
     static = StaticMode(world, 630 if quick else None)
     looks = static.grid(seed, lambda stage, f: progress(stage, 0.78 + 0.08 * f))
     X_static = fit_rigid(np.array([k.X_BF.translation() for k in looks]), np.array([k.fit.center_C for k in looks]))

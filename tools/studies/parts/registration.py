@@ -21,7 +21,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.scans import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
+from weldcal.tools.worlds.parts.scans import REFUSALS, PartScene, Subject, scan_scene, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part
@@ -41,7 +41,6 @@ SCENES: dict[str, Mapping[str, object]] = {
     "on its side": {"objects": 5, "fingers": 0, "on_side": True},
     "in a vice": {"objects": 4, "fingers": 0, "in_vice": True},
     "partly out of view": {"objects": 5, "fingers": 0, "spread_m": 0.22},
-    "scanned mesh": {"objects": 6, "fingers": 1},
 }
 
 
@@ -68,13 +67,12 @@ def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
     options: dict[str, object] = {"objects": 4, "fingers": 1} if kind == "plan" else dict(SCENES[kind])
     scene: PartScene = scan_scene(part.mesh, scanner, number, **options)  # type: ignore[arg-type]
     rng = np.random.default_rng([seed, 1803])
-    mesh = scanned_mesh(part.mesh, rng) if kind == "scanned mesh" else part.mesh
     off = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3) * HINT_RAD), rng.uniform(-1.0, 1.0, 3) * HINT_M)
     row: dict[str, object] = {"kind": kind, "part": name, "seed": seed}
     start = time.process_time()
     try:
         found, joint = locate_part(
-            scene.cloud_B, mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if hinted else None
+            scene.cloud_B, part.mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if hinted else None
         )
     except (PartNotFound, AmbiguousPart) as error:
         return {

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -402,24 +401,6 @@ def block() -> TriMesh:
 
 
 MESH_NOISE_M, MESH_WAVE_M, MESH_TRIANGLES = 1e-4, 0.015, 15_000
-
-
-def scanned_mesh(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
-    """The part as a mesh file made from a scan: small triangles, its surface off by 0.1 mm in waves of MESH_WAVE_M."""
-    import open3d
-
-    fine: Any = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.copy()), open3d.utility.Vector3iVector(mesh.triangles.copy())
-    )
-    fine.merge_close_vertices(1e-7)
-    while len(fine.triangles) < MESH_TRIANGLES:
-        fine = fine.subdivide_midpoint(1)
-    corners = np.asarray(fine.vertices)
-    # The triangles are slivers in places: an error of each corner by itself would fold the surface.
-    waves = rng.normal(size=(3, 3, 60)) * (2.0 * math.pi / MESH_WAVE_M / math.sqrt(3.0))
-    phase = rng.uniform(0.0, 2.0 * math.pi, size=(3, 1, 60))
-    error = MESH_NOISE_M * math.sqrt(2.0 / 60.0) * np.cos(corners @ waves + phase).sum(axis=2).T
-    return TriMesh(corners + error, np.asarray(fine.triangles, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,7 @@ class CellRun:
 
     Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is felt (sd
     about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
-    coefficient of variation in %. `cpu_per_second`: processor seconds (all threads) per simulated second of the weld.
+    coefficient of variation in %.
     """
 
     scenario: str
@@ -242,10 +242,9 @@ class CellRun:
     space_max_mm: float = np.nan
     cv_percent: float = np.nan
     real_time_factor: float = np.nan
-    cpu_per_second: float = np.nan
 
 
-def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: float) -> CellRun:
+def figures(result: DemoResult, name: str, law: str, seed: int) -> CellRun:
     """Return the figures of a finished run, in mm."""
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
@@ -266,7 +265,6 @@ def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: 
         space_max_mm=1e3 * float(np.hypot(weld.error.lateral, weld.error.height).max()),
         cv_percent=1e2 * weld.speed.cv,
         real_time_factor=run.real_time_factor("weld"),
-        cpu_per_second=cpu_per_second,
     )
 
 
