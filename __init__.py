@@ -7,17 +7,17 @@ fast.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from weldcal.models.errors import InputError, WeldcalError
+    from weldcal.models.errors import InputError as InputError, WeldcalError as WeldcalError
     from weldcal.tools.api import (
-        build_cell,
-        calibrate,
-        fit_flange,
-        hand_eye,
-        load_scenario,
-        read_calibration,
-        read_cloud,
-        run,
-        verify,
+        build_cell as build_cell,
+        calibrate as calibrate,
+        fit_flange as fit_flange,
+        hand_eye as hand_eye,
+        load_scenario as load_scenario,
+        read_calibration as read_calibration,
+        read_cloud as read_cloud,
+        run as run,
+        verify as verify,
     )
 
     __version__: str
@@ -38,18 +38,3 @@ else:
 
     def __dir__() -> list[str]:
         return [*_names(), "__version__"]
-
-
-__all__ = [
-    "InputError",
-    "WeldcalError",
-    "build_cell",
-    "calibrate",
-    "fit_flange",
-    "hand_eye",
-    "load_scenario",
-    "read_calibration",
-    "read_cloud",
-    "run",
-    "verify",
-]

@@ -8,19 +8,20 @@ from typing import Any
 
 
 @cache
-def _homes(package: str) -> dict[str, tuple[str, str]]:
-    """Return the module, and the name in it, of each name that the package's file imports."""
+def _homes(package: str) -> dict[str, str]:
+    """Return the module of each name that the package's file imports under TYPE_CHECKING."""
     import ast
 
     loader: Any = sys.modules[package].__loader__
-    lines = [node for node in ast.walk(ast.parse(loader.get_source(package))) if isinstance(node, ast.ImportFrom)]
-    return {alias.asname or alias.name: (str(line.module), alias.name) for line in lines for alias in line.names}
+    checked = next(node for node in ast.parse(loader.get_source(package)).body if isinstance(node, ast.If))
+    lines = [node for node in checked.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(line.module) for line in lines for alias in line.names}
 
 
 def exported(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """Make the `__getattr__` and `__dir__` of a package whose imports are under TYPE_CHECKING.
 
-    A type checker reads these imports. At run time the first use of a name in `__all__` imports its module.
+    A type checker reads these imports. At run time the first use of a name imports its module; `__all__` has them all.
 
     Raises:
         AttributeError: by `__getattr__`, for any other name.
@@ -28,11 +29,13 @@ def exported(package: str) -> tuple[Callable[[str], object], Callable[[], list[s
     module = sys.modules[package]
 
     def load(name: str) -> object:
-        if name not in module.__all__:
+        homes = _homes(package)
+        if name == "__all__":
+            return sorted(homes)
+        if name not in homes:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        home, own = _homes(package)[name]
-        found = getattr(importlib.import_module(home), own)
+        found = getattr(importlib.import_module(homes[name]), name)
         setattr(module, name, found)
         return found
 
-    return load, lambda: sorted({*vars(module), *module.__all__})
+    return load, lambda: sorted({*vars(module), *_homes(package)})
