@@ -35,7 +35,9 @@ def tools(folder: Path, seed: int) -> None:
     """Write true.yaml, the bent torch, and measured.yaml, what scans and touches find of it."""
     bent = cell(seed, Wrong(bend=BENT_M, tilt=TILTED_RAD))
     found = measure_tool(load_tool(WELDING), bent.scans, bent.covariance, bent.touches)
-    true: Any = SimpleNamespace(tool=found.tool, p_FW=bent.truth.p_FW, axis=bent.truth.axis, move=lambda _: None)
+    true: Any = SimpleNamespace(
+        tool=found.tool, p_FW=bent.truth.p_FW, axis=bent.truth.axis, move=lambda _: None, stick_out_m=float("nan")
+    )
     (folder / "measured.yaml").write_text(tool_text(found, measured_file(found), "scans"), encoding="utf-8")
     (folder / "true.yaml").write_text(yaml.safe_dump(measured_file(true)), encoding="utf-8")
 

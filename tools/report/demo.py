@@ -269,8 +269,9 @@ class DemoResult:
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
             found["plan_words"] = plan.summary
             travel = self.run.cell.job.travel
-            found["seam_order"] = [k + 1 for k in travel.order]
-            found["seam_travel_mm"], found["listed_travel_mm"] = 1e3 * travel.travel_m, 1e3 * travel.listed_m
+            if len(travel.order) > 1:
+                found["seam_order"] = [k + 1 for k in travel.order]
+                found["seam_travel_mm"], found["listed_travel_mm"] = 1e3 * travel.travel_m, 1e3 * travel.listed_m
             found["felt"] = felt_seams(self.run)
             if np.isfinite(plan.arm_sigma_m):
                 found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m

@@ -33,6 +33,7 @@ OTHER_M = 0.0025
 SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
+BLOCK_M = 0.005  # a choice: twice OTHER_M, on top of what the tool reaches below the table
 LEAST_PIECE_M = 0.010  # of a seam beyond the place where the tip comes down
 WIRE_M = 0.001  # radius of the wire with its play
 
@@ -145,7 +146,13 @@ def check_beside(
                     " seam"
                 )
                 if z < table_z_m + OTHER_M:
-                    what, change = f"The tool would touch the table {there}", "raise the part"
+                    low = min(
+                        float((at.position + np.add([a, b], [0.0, 0.0, up]) @ turn.T)[:, 2].min()) - wide
+                        for _, up, at, turn in held
+                        for a, b, wide in spans[: len(above)]
+                    )
+                    what = f"The tool would touch the table {there}"
+                    change = f"raise the part by {math.ceil(1e3 * (table_z_m - low + BLOCK_M))} mm"
                 else:
                     what, change = f"The tool would touch something that is not in the drawing {there}", "remove it"
                 raise NoClearance(

@@ -121,8 +121,7 @@ def test_a_part_that_no_place_lets_the_arm_weld_is_no_cell(tmp_path: Path) -> No
 
 
 def test_a_seam_that_begins_at_the_table_is_no_cell(angle: Path, tmp_path: Path) -> None:
-    """The angle stands on its end: along the drawing the arm reaches the seam, and the scan shows the table beside
-    it."""
+    """The angle stands on its end: the arm reaches the seam, and the tool would meet the table beside it."""
     written, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(angle))
     assert written.name == "unfinished.yaml"
     assert re.search("would touch the table near .* at 0 mm of the seam: raise the part", reason)

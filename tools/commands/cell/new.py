@@ -30,9 +30,9 @@ from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam, plan_seam
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
-from weldcal.systems.messages import Scan
+from weldcal.systems.messages import PlannedSeam, Scan
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, SeamConfig, ToolFile, WorkpieceConfig
@@ -46,6 +46,7 @@ from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.run import RunOptions
+from weldcal.welding.seam.clearance import NoClearance, check_beside
 
 BASE, EXAMPLE = "s_groove", "calibrate_only"
 SMALL = "scanner: {width: 412, height: 308}"  # pixels of the example's scans: a few hundred kB each
@@ -99,6 +100,7 @@ TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
 MOST_PLANNING_S = 60.0  # of processor time for the seams of a part: a choice, a user waits no longer
+TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
@@ -399,7 +401,7 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
         station = make_station(scenario, 0)
     except WeldcalError as error:
         return own, str(error)
-    nearest, nearest_pose = (-1, ""), own
+    nearest, nearest_pose = (-1.0, ""), own
     try:
         part = station.cad
         if not isinstance(part, Part) or station.tool is None:
@@ -426,17 +428,32 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
 
 def _first_refusal(
     scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
-) -> tuple[int, str]:
+) -> tuple[float, str]:
     """Count the seams before the first that the arm cannot weld with the part in a pose, and say why ("": all)."""
     for number, part in enumerate(seams):
         config = servo_config(scenario, station, number)
         planning = dc.replace(
             seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
         )
-        reason = plan_drawn_seam(planning, 0).reason
-        if reason is not None:
-            return number, reason
+        plan = plan_drawn_seam(planning, 0)
+        if plan.reason is not None:
+            return number, plan.reason
+        if reason := _at_the_table(planning, part, plan):
+            return number + 0.5, reason  # nearer to a weld than where the arm has no way
     return len(seams), ""
+
+
+def _at_the_table(planning: SeamPlanning, part: WeldPart, plan: PlannedSeam) -> str:
+    """Why the tool has no room above the table along a planned seam; "" where it has."""
+    assert plan.seam is not None
+    p_B = np.asarray(plan.seam.position(np.linspace(0.0, plan.seam.length, 50)))[:, :2]
+    x, y = (np.arange(low, high, TABLE_PITCH_M) for low, high in zip(p_B.min(0) - 0.2, p_B.max(0) + 0.2, strict=True))
+    table = np.stack(np.meshgrid(x, y, [planning.table_z_m]), axis=-1).reshape(-1, 3)
+    try:
+        check_beside(table, part.mesh, planning.X_BP_guess, plan.seam, planning.tool, plan.lean_rad, planning.table_z_m)
+    except NoClearance as error:
+        return str(error)
+    return ""
 
 
 def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseConfig) -> str:
