@@ -14,8 +14,8 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     "modules": 560,  # files with code in the five folders
-    "code lines": 100_200,  # without blank lines, comments and docstrings
-    "lines of studies": 10_590,  # in tools/studies, all lines
+    "code lines": 100_430,  # without blank lines, comments and docstrings
+    "lines of studies": 9_980,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

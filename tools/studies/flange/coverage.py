@@ -51,7 +51,8 @@ class Coverage:
 
     Of X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both
     means over the runs, with the noise of the held-out scan in both (NaN where that was not looked at).
-    ``corrected``: with a scanner that is off in scale and gradient, and its correction.
+    ``corrected``: with a scanner that is off in scale and gradient, and its correction; ``warped``: with one that
+    errs by another model.
     """
 
     poses: int
@@ -60,6 +61,7 @@ class Coverage:
     point: float
     held_out_over_true: float
     corrected: bool = False
+    warped: bool = False
 
     def chance(self) -> tuple[float, float]:
         """Shares between which 99 % of such studies fall where the regions are exact."""
@@ -112,14 +114,16 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
     return Coverage(poses=poses, runs=runs, pose=pose, point=point, held_out_over_true=float("nan"), corrected=True)
 
 
-def _inside(calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress) -> tuple[float, float]:
+def _inside(
+    calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress, work_C: Array = WORK_C
+) -> tuple[float, float]:
     """Shares of calibrations whose 95 % regions of X_BC and of the work point hold the truth."""
     inside = np.zeros(2)
     for k in range(runs):
         if k % 20 == 0:
             progress(name, k / runs)
         estimate, X_BC, found_BQ = calibrate(k)
-        p_BQ = X_BC @ WORK_C
+        p_BQ = X_BC @ work_C
         turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
         e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found_BQ
         inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
@@ -135,7 +139,7 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     for ax, corrected, title in zip(
         axes, (False, True), ("an exact scanner", "a scanner off by 0.2 %, corrected"), strict=True
     ):
-        chosen = [s for s in studies if s.corrected == corrected]
+        chosen = [s for s in studies if s.corrected == corrected and not s.warped]
         n = [s.poses for s in chosen]
         ax.axhspan(100 * low, 100 * high, color="#1d5f8a", alpha=0.10, linewidth=0)
         ax.axhline(95.0, color="#444", linewidth=1, linestyle="--")
@@ -149,9 +153,34 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     return svg(figure, *axes)
 
 
+def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Coverage:
+    """Calibrate ``runs`` devices, each with a warp of its own, from ``poses`` scans each."""
+    stated, true = [], []
+
+    def calibrate(device: int) -> Calibrated:
+        _, estimate = wrong_models.calibrate_warped(device, poses)
+        seen = wrong_models.warped_point(wrong_models.WORK_C, device)
+        stated.append(float(np.mean(estimate.held_out.position_m)))
+        true.append(float(np.mean(wrong_models.new_errors(device, estimate))))
+        found = seen if estimate.correction is None else estimate.correction.points(seen)
+        return estimate, wrong_models.X_BC, estimate.X_BC @ found
+
+    name = f"calibrations of {poses} scans by a warped scanner"
+    pose, point = _inside(calibrate, name, runs, progress, wrong_models.WORK_C)
+    return Coverage(
+        poses=poses,
+        runs=runs,
+        pose=pose,
+        point=point,
+        held_out_over_true=float(np.mean(stated) / np.mean(true)),
+        corrected=True,
+        warped=True,
+    )
+
+
 def _coverage_rows(f: Figures) -> Iterable[Row]:
     for s in f["studies"]:
-        kind = "corrected" if s["corrected"] else "exact"
+        kind = "of another model" if s["warped"] else "corrected" if s["corrected"] else "exact"
         shares = (f"{100 * s[key]:.1f} %" for key in ("pose", "point"))
         yield str(s["poses"]), kind, *shares, fixed(s["held_out_over_true"])
 
@@ -173,6 +202,7 @@ def honesty(
     folder = HONESTY.folder(call)
     studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
     studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), call.progress))
     write_atomic(folder / "coverage.svg", coverage_picture(studies))
     return HONESTY.found({"studies": [vars(s) for s in studies]}, folder)
 

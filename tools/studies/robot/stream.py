@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses as dc
-from collections.abc import Mapping
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
@@ -227,6 +230,21 @@ def stream(
     return found.summary()
 
 
+BUSY = "while True: pass"
+
+
+@contextmanager
+def busy_programs(count: int) -> Iterator[None]:
+    """Programs of ordinary priority that each want a whole core, for the duration of the block."""
+    programs = [subprocess.Popen([sys.executable, "-I", "-S", "-c", BUSY]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
 @dataclass(frozen=True, kw_only=True)
 class JobTiming:
     """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and the torch's error."""
@@ -257,6 +275,7 @@ class JobsReport:
     """All jobs of a study."""
 
     jobs: list[JobTiming]
+    load: int
     host: HostLateness
 
     @property
@@ -272,6 +291,7 @@ class JobsReport:
             "state": "done",
             "jobs": len(self.jobs),
             "jobs_done": sum(job.state == "done" for job in self.jobs),
+            "busy_programs": self.load,
             "under_4_ms_percent": late.on_time_percent,
             "over_8_ms": late.over(8.0),
             "over_8_ms_by_host": self.host.caused([job.lateness for job in self.jobs]),
@@ -290,6 +310,7 @@ def run_jobs(
     runs: int,
     *,
     seed: int = 0,
+    load: int = 0,
     seam_mm: float | None = None,
     transport: str = NATIVE,
     progress: Progress = no_progress,
@@ -301,19 +322,20 @@ def run_jobs(
         out: gets jobs.json, and a folder with the report of each job.
         runs: how many jobs.
         seed: of the first.
+        load: busy programs beside.
         transport: native or ur_rtde.
         seam_mm: length of the seam to weld; the scenario's where None.
         progress: gets the job that runs.
     """
     found = []
     overrides = "" if seam_mm is None else f"welding: {{seam_length_mm: {seam_mm}}}"
-    with watched_host() as host:
+    with watched_host() as host, busy_programs(load):
         for k in range(runs):
             progress(f"job {k + 1} of {runs}", k / runs)
             described = load_scenario(scenario, overrides)
             described.robot = dc.replace(robot_at("", described), transport=transport)
             found.append(_job(described, out / f"seed{seed + k}", scenario, seed + k))
-    report = JobsReport(found, host)
+    report = JobsReport(found, load, host)
     write_json(out / "jobs.json", report.summary() | {"rows": {f"seed {job.seed}": job.line for job in found}})
     return report
 
@@ -348,18 +370,21 @@ def jobs(
         str, option("--scenario", "NAME", "Name of a scenario, or path of a scenario YAML file.")
     ] = "s_groove",
     runs: Annotated[int, option("--runs", "N", "Number of jobs.", min=1)] = 10,
+    load: Annotated[int, option("--load", "N", "Busy programs beside the jobs.", min=0)] = 0,
     seam_mm: Annotated[
         float | None, option("--seam-mm", "MM", "Length of the seam.", min=10.0, show_default="the scenario's")
     ] = None,
     transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Outcome:
-    """Run whole jobs on an emulated controller in real time: how late the velocities are."""
+    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy
+    programs."""
     folder = call.folder("benchmark", f"robot-jobs-{scenario}")
     result = run_jobs(
         scenario,
         folder,
         runs,
         seed=call.seed,
+        load=load,
         seam_mm=seam_mm,
         transport=one_transport(transport),
         progress=call.progress,
