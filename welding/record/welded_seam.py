@@ -137,7 +137,7 @@ def _stands(length: Array, dt: Array, burns: Sequence[Array], start_s: float, cr
     for burn in burns:
         rows = slice(k, k + len(burn) - 1)
         for turn, ordered_s in ((1, start_s), (-1, crater_s)):
-            begun = np.logical_and.accumulate(still[rows][::turn]) & (np.cumsum(dt[rows][::turn]) <= ordered_s)
+            begun = still[rows][::turn] & (np.cumsum(dt[rows][::turn]) <= ordered_s)
             found[rows] |= begun[::turn]
         k += len(burn)
     return found
