@@ -29,9 +29,9 @@ FORBIDDEN = re.compile(
 )
 # What the source still has of each; a count may only fall. Lower the number when it did.
 CEILINGS = {
-    "first lines that are longer than one line": 41,
+    "first lines that are longer than one line": 40,
     "first lines with a forbidden word": 42,
-    "docstring sentences over 30 words": 196,
+    "docstring sentences over 30 words": 194,
     "messages with a sentence over 30 words": 0,
     "messages with a forbidden word": 0,
 }

@@ -131,7 +131,7 @@ def welded_seam(record: WeldRecord, numbers: Numbers, rows: NDArray[np.bool_]) -
 
 
 def _stands(length: Array, dt: Array, burns: Sequence[Array], start_s: float, crater_s: float) -> NDArray[np.bool_]:
-    """The steps (N,) for which the torch stands as ordered, at the start of a burn and at its end."""
+    """The steps (N,) in which the torch is at rest as ordered, at the start of a burn and at its end."""
     still = length < _AT_REST * np.median(length[length > 0.0]) if length.any() else length < 0.0
     found, k = np.zeros(len(length), dtype=bool), 0
     for burn in burns:

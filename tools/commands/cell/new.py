@@ -444,7 +444,7 @@ def _first_refusal(
 
 
 def _at_the_table(planning: SeamPlanning, part: WeldPart, plan: PlannedSeam) -> str:
-    """Why the tool has no room above the table along a planned seam; "" where it has."""
+    """Why the tool would touch the table along a planned seam; "" where it would not."""
     assert plan.seam is not None
     p_B = np.asarray(plan.seam.position(np.linspace(0.0, plan.seam.length, 50)))[:, :2]
     x, y = (np.arange(low, high, TABLE_PITCH_M) for low, high in zip(p_B.min(0) - 0.2, p_B.max(0) + 0.2, strict=True))
