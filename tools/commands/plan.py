@@ -266,7 +266,7 @@ def plan_passes(
         option("--depth-mm", "MM", "Filled up to this height over the root.", show_default="a groove's depth"),
     ] = None,
     wire_feed_m_min: Annotated[
-        float | None, option("--wire-feed-m-min", "M", "Of all passes.", show_default="the scenario's")
+        float | None, option("--wire-feed-m-min", "M", "Of all passes.", min=0.1, show_default="the scenario's")
     ] = None,
     wire_mm: Annotated[float, option("--wire-mm", "MM", "Diameter of the wire.", min=0.5, max=4.0)] = 1.2,
     widest_mm: Annotated[float, option("--widest-mm", "MM", "Widest bead.", min=2.0)] = 1e3 * WIDEST_M,
