@@ -146,6 +146,11 @@ class Physics:
         self.collisions = 0
         self._touches = False
 
+    @property
+    def samples(self) -> bool:
+        """Whether the newest frame is one of those whose torch is stored."""
+        return self._frame % LOG_EVERY == 0
+
     def step(self, q: Array, qd: Array, arc: Arc) -> None:
         """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc`: whether the arc burns."""
         self._frame += 1
@@ -157,7 +162,7 @@ class Physics:
             self.arc_on_s += STEP_S
             if not self._burns:
                 self.burns.append([])
-            if self._frame % LOG_EVERY == 0 and self._torch_port is not None:
+            if self.samples and self._torch_port is not None:
                 self.burns[-1].append(np.array(self._torch_port.Eval(self._context)))
         self._burns = arc.burns
         if self._frame % COLLISION_EVERY == 0:
@@ -273,6 +278,11 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
             "torch_max_mm": float(distance.max()),
             "torch_lateral_mean_mm": float(lateral.mean()),
             "torch_lateral_max_mm": float(lateral.max()),
+            "torch_every_s": LOG_EVERY * STEP_S,
+            "torch_s_left_up_mm": [
+                np.round(1e3 * np.column_stack([error.s, error.lateral, error.height]), 4).tolist()
+                for _, error in errors
+            ],
         }
         if len({numbers for numbers, _ in errors}) > 1:
             found["burns"] = [
