@@ -33,7 +33,7 @@ WEAVES = [
 
 
 ORDERS = [
-    "welding: {angles: {work_angle_deg: [-4, 4], travel_angle_deg: 4}}",
+    "welding: {angles: {work_angle_deg: [-4, 4], travel_angle_deg: 1.4}}",
     "welding: {stitch: {on_mm: 15, off_mm: 10, order: middle_out}}",
 ]
 
