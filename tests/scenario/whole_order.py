@@ -28,7 +28,10 @@ from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 BENT_M, TILTED_RAD = 1.5e-3, 0.01  # of the torch against the shipped tool file
 POWER_PORT = 5021
-ANALOG = "  wire_feed: {output: 0, at_full: 22.0}\n  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0}\n"
+ANALOG = """\
+  wire_feed: {output: 0, at_full: 22.0, value: 6.0}
+  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0, value: 20.0}
+"""
 CAP = {"lateral_mm": 2.0, "vertical_mm": 3.0, "reverse": True, "interpass_s": 5.0}
 TACKS = [{"from_mm": 20.0, "to_mm": 32.0, "height_mm": 4.5, "seam": 2}]
 
@@ -84,6 +87,7 @@ def texts(folder: Path, more: dict[str, Any], *, analog: bool) -> tuple[str, str
     }
     if analog:
         del welding["schedule"]["job"]
+        welding["process"] |= {"current_A": 180.0, "voltage_V": 20.0}
     cell_keys = {
         "workpiece": piece,
         "tool": {"file": str(folder / "measured.yaml")},

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.clearance import lowest_point, self_distance
+from weldcal.calibration.planning.clearance import TOOL, LinkCapsule, lowest_point, self_distance
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -102,6 +102,14 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
     return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).set_up_world)
 
 
+def to_the_wire(body: LinkCapsule, tool: WeldingTool | None) -> LinkCapsule:
+    """Return a body of the clearance checks; the torch's ends where the wire does, and its round end not beyond it."""
+    if tool is None or body.link != TOOL or np.linalg.norm(body.p_end - tool.X_FT @ tool.p_TW) > body.radius:
+        return body
+    way = body.p_end - body.p_start
+    return dc.replace(body, p_end=body.p_end - body.radius * way / np.linalg.norm(way))
+
+
 def still(station: Station, q: Array) -> tuple[Simulator, Context]:
     """A simulator of the station with the joint servos' reference at `q` (6,) rad and every other input at zero."""
     simulator = Simulator(station.diagram)
@@ -125,7 +133,7 @@ class Physics:
         self._table_z_m = scenario.table_height_m()
         self._joints = Repeatability(arm, repeatability_mm, seed)
         self._arm = arm
-        self._bodies = station_bodies(self.station)
+        self._bodies = [to_the_wire(body, self.station.tool) for body in station_bodies(self.station)]
         self._simulator, self._context = still(self.station, self.station.q_start)
         self._simulator.Initialize()
         diagram, plant = self.station.diagram, self.world.plant
