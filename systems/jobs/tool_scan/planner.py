@@ -26,7 +26,7 @@ from weldcal.systems.scenario.schema import FILE, Scenario
 from weldcal.systems.station import Station
 
 FEWEST, MOST = 8, 40
-_TRIALS, _CANDIDATES = 6000, 80  # choices: half a minute at most
+_TRIALS, _CANDIDATES = 2000, 80  # choices: half a minute at most
 _LOW_RAD, _HIGH_RAD = np.radians(-40.0), np.radians(40.0)  # of the view over the square to the nozzle, from the wire
 _OF_EACH = 4  # scans of the tip, and of the ring; a fit needs three
 _SIGHT_M = 0.005  # a choice: a calibrated scanner is known to less
@@ -104,8 +104,9 @@ def plan_tool_views(scenario: Scenario, station: Station, seed: int) -> tuple[To
     if len(chosen) < config.scans:
         reason = why.most_common(1)[0][0] if why and len(pool) < config.scans else "a move to the next one is not clear"
         raise UnreachableScanner(
-            f"Only {len(chosen)} of {config.scans} scans of the tool can be taken, most often because {reason}: choose"
-            f" another home_deg below the scanner, clear the place around it, or ask for fewer scans, {FEWEST} or more."
+            f"Only {len(chosen)} of {config.scans} scans of the tool can be taken, most often because {reason}. Choose a"
+            f" home_deg nearer to the scanner's working range, clear that place, or ask for fewer scans, {FEWEST} or"
+            " more."
         )
     return (*chosen, *_ring_views(cell, loaded.tool, chosen[-1].q))
 
@@ -172,6 +173,7 @@ def _pool(cell: _Cell, loaded: LoadedTool) -> tuple[list[ToolView], Counter[str]
     rng, home, bodies, X_BC = np.random.default_rng(limits.seed), cell.home, station_bodies(cell.station), cell.X_BC
     axes = frames_along(loaded.torch_axis[None])[0].T
     behind = np.array([0.0, part.start_m, part.start_m + 0.5 * part.length_m, part.start_m + part.length_m])
+    reach = float(np.abs(arm.stack[:, :3, 3]).sum())
     nozzle = loaded.p_FW - behind[:, None] * axes[2]
     tip = np.array(tool.X_FT.translation())[None]
     pool: list[ToolView] = []
@@ -186,7 +188,7 @@ def _pool(cell: _Cell, loaded: LoadedTool) -> tuple[list[ToolView], Counter[str]
         if not _in_view(scanner, X_CF, nozzle, limits.image_margin):
             why["the nozzle does not fit into the scanner's view"] += 1
             continue
-        q = nearest_solution(arm, X_BF, home)
+        q = nearest_solution(arm, X_BF, home) if float(np.linalg.norm(X_BF.translation())) <= reach else None
         if q is None:
             why["the scanner's working range is out of the arm's reach"] += 1
             continue

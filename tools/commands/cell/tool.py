@@ -25,7 +25,7 @@ from weldcal.calibration.tool.measure import Move, NozzlePart, ToolMeasurement, 
 from weldcal.calibration.tool.wire import read_wire_touches
 from weldcal.models.errors import InputError
 from weldcal.models.tools.loading import check_sight, load_tool, tool_file
-from weldcal.systems.jobs.tool_scan.planner import FEWEST, MOST, ToolScanConfig
+from weldcal.systems.jobs.tool_scan.planner import FEWEST, MOST, ToolScanConfig, check_tool_scan
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, WeldingConfig
@@ -297,6 +297,7 @@ def showing_tool(name: str, calibration: Path | None, scans: int | None = None) 
         raise InputError("The tool is scanned with a calibrated scanner: give --calibration RESULT.")
     scenario.tool_scan = replace(config, result=str(result), scans=scans or config.scans)
     scenario.job.calibrate = scenario.job.weld = False
+    check_tool_scan(scenario)  # first: its sentences name this job
     use_kinematics(scenario, result)
     check_scenario(scenario)
     return scenario
