@@ -319,7 +319,10 @@ def _of_second(name: str) -> str:
 
 
 def _tool(scenario: Scenario, cad: WeldPart | None, *, simulated: bool = False) -> WeldingTool | None:
-    """Return the welding tool, or the one that the simulated arm carries, with the scenario's press deflections and the groove angle of the workpiece."""
+    """Return the welding tool, or the one that the simulated arm carries.
+
+    It has the scenario's press deflections and the groove angle of the workpiece.
+    """
     loaded, welding, camera = scenario.loaded_tool(simulated=simulated), scenario.welding, scenario.finger_camera
     if loaded is None:
         return None

@@ -73,7 +73,7 @@ def check_tool_scan(scenario: Scenario) -> None:
 
 @dc.dataclass(frozen=True, eq=False)
 class ToolView:
-    """The arm's joints (6,) rad at a scan, the direction (3,) to the scanner in F, and whether it shows the tip."""
+    """The arm's joints (6,) rad at a scan, the direction (3,) in F to the scanner, and whether the tip is in sight."""
 
     q: Array
     direction_F: Array
@@ -81,7 +81,7 @@ class ToolView:
 
 
 def plan_tool_views(scenario: Scenario, station: Station, seed: int) -> tuple[ToolView, ...]:
-    """Plan the scans of the tool, in the order in which they are taken; all moves are straight in joint space and clear.
+    """Plan the scans of the tool, in the order in which they are taken; all moves between them are clear.
 
     Raises:
         UnreachableScanner: too few are clear.

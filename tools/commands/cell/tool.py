@@ -1,4 +1,4 @@
-"""weldcal tool check: draws a tool; weldcal tool measure: measures it by scans, of a file or of its arm, and touches."""
+"""weldcal tool check: draws a tool; weldcal tool measure: measures it by scans, also of its own arm, and touches."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -344,7 +344,7 @@ def run_tool_scan(
         held = {"state": "held", "reason": run.reason or ""}
         return Outcome(held | about | run.timing(), values={}, problem=run.reason or "")
     asked = order(dataset=folder, calibration=Path(config.result), tool=loaded.file)
-    report = run_measurement(asked, options.out, progress)
+    report = run_measurement(asked, options.out, lambda stage, share: progress(stage, 0.9 + 0.1 * share))
     return Outcome(report.summary() | about | run.timing(), values={}, rows={"scans": str(len(poses)), **report.rows()})
 
 
