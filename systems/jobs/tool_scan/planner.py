@@ -104,8 +104,8 @@ def plan_tool_views(scenario: Scenario, station: Station, seed: int) -> tuple[To
     if len(chosen) < config.scans:
         reason = why.most_common(1)[0][0] if why and len(pool) < config.scans else "a move to the next one is not clear"
         raise UnreachableScanner(
-            f"Only {len(chosen)} of {config.scans} scans of the tool can be taken, most often because {reason}. Choose a"
-            f" home_deg nearer to the scanner's working range, clear that place, or ask for fewer scans, {FEWEST} or"
+            f"Only {len(chosen)} of {config.scans} scans of the tool can be taken, most often because {reason}. Choose"
+            f" a home_deg nearer to the scanner's working range, clear that place, or ask for fewer scans, {FEWEST} or"
             " more."
         )
     return (*chosen, *_ring_views(cell, loaded.tool, chosen[-1].q))
