@@ -31,17 +31,20 @@ from weldcal.tools.commands.cell.tool import showing_tool
 
 NOMINAL = load_tool(WELDING)
 BEND = np.array([1.2e-3, -0.9e-3, 0.0])  # 1.5 mm
+RING_MM = np.array([0.0, 0.8, 0.0])  # off its place
 AXIS = np.array([0.012, -0.009, 1.0]) / np.linalg.norm([0.012, -0.009, 1.0])  # 0.86 degrees
 
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """A scenario whose world has a bent torch, and the result of its calibration."""
+    """A scenario whose world has a bent torch and a shifted ring, and the result of its calibration."""
     folder = tmp_path_factory.mktemp("tool_scan")
     true: Any = SimpleNamespace(
         tool=NOMINAL, p_FW=NOMINAL.p_FW + BEND, axis=AXIS, move=lambda _: None, stick_out_m=float("nan")
     )
-    (folder / "bent.yaml").write_text(yaml.safe_dump(measured_file(true)))
+    bent = measured_file(true)
+    bent["ring"]["xyz_mm"] = (RING_MM + bent["ring"]["xyz_mm"]).tolist()
+    (folder / "bent.yaml").write_text(yaml.safe_dump(bent))
     tool = f"tool: {{file: {WELDING}, simulated: bent.yaml}}"
     scanner = (
         "scanner: !RenderedScanner {preset: phoxi_m, width: 824, height: 616, exposure_s: 0.1, scale_error: 0.0,"
@@ -74,8 +77,10 @@ def test_the_arm_shows_a_bent_torch_and_its_bend_is_found(cell: tuple[str, Path]
     assert np.degrees(np.arccos(axis @ AXIS)) < 0.2
     assert told["moved"]["nozzle"]["moved"]
     assert not told["moved"]["tip"]["moved"]
-    assert not told["moved"]["ring"]["moved"]
-    assert abs(told["torch"]["stick_out_mm"] - 12.0) < 0.7
+    assert told["moved"]["ring"]["moved"]
+    assert np.linalg.norm(told["moved"]["ring"]["shift_mm"] - RING_MM) < 0.1
+    assert told["moved"]["ring"]["turned_deg"] < 0.05
+    assert abs(told["torch"]["stick_out_mm"] - 12.0) < 0.5  # the mouth, by its last pixels
     assert told["cause"].startswith("The torch is bent")
     data = load_dataset(tmp_path / "out/scans")
     joints = data.joints()
