@@ -83,6 +83,7 @@ TOUCH_STEPS: Steps = (
     ("Touch", ("to_above", "zero", "descend", "press", "lift")),
     ("Go home", ("go_home",)),
 )
+TOOL_SCAN_STEPS: Steps = (("Scan the tool", ("start", "to_home", "move", "scan")), ("Go home", ("go_home",)))
 PROFILER_STEPS = {
     "start": "Get ready",
     "edge": "Scan the edge",

@@ -227,13 +227,14 @@ def _make_station(
     world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
         setup = WorldSetup() if set_up_world is None else set_up_world(scenario, rng, real, X_BP)
+        build.tool = _tool(scenario, cad, simulated=True)
         true_arm, second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
         if second is not None:
             second = dc.replace(second, arm=scenario.robot_2.true_arm(second.arm, second.q_start, rng))
         world = build_world(
             builder,
             true_arm,
-            tool,
+            build.tool,
             robot.q_start,
             flange=scenario.flange_name(),
             table=table_in_base(scenario),
@@ -317,9 +318,12 @@ def _of_second(name: str) -> str:
     return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 
-def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
-    """Return the welding tool with the scenario's press deflections and the groove angle of the workpiece."""
-    loaded, welding, camera = scenario.loaded_tool(), scenario.welding, scenario.finger_camera
+def _tool(scenario: Scenario, cad: WeldPart | None, *, simulated: bool = False) -> WeldingTool | None:
+    """Return the welding tool, or the one that the simulated arm carries.
+
+    It has the scenario's press deflections and the groove angle of the workpiece.
+    """
+    loaded, welding, camera = scenario.loaded_tool(simulated=simulated), scenario.welding, scenario.finger_camera
     if loaded is None:
         return None
     tool = loaded.tool

@@ -151,7 +151,7 @@ def _candidates(
         elif float(np.linalg.norm(X_BF.translation())) <= reach:
             q = nearest_solution(arm, X_BF, q_start)
         if q is not None:
-            reason = _refuse(arm, q, X_BC, X_BR, ring_R, bodies, q_start, config)
+            reason = why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, q_start, config)
         if q is None or reason:
             why[reason] += 1
         else:
@@ -188,17 +188,17 @@ def random_view(
     return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
 
 
-def _refuse(
+def why_not(
     arm: ArmModel,
     q: Array,
     X_BC: RigidTransform,
-    X_BR: RigidTransform,
-    ring_R: Array,
+    points_B: Array,
     bodies: list[LinkCapsule],
     q_start: Array,
     config: PlannerConfig,
+    what: str = "flange",
 ) -> str:
-    """Why this posture will not do, or an empty text."""
+    """Return why the scanner cannot scan points (N, 3) m of ``what`` in this posture, or an empty text."""
     if float(np.abs(q - q_start).max()) > config.max_travel_rad:
         return "the joints would have to travel too far from the start posture"
     if sigma_min(jacobian(arm, q)) < config.min_sigma:
@@ -211,14 +211,13 @@ def _refuse(
     if touched := config.surroundings.touched(bodies, frames):
         return f"{touched} is in the way"
     eye = np.asarray(X_BC.translation())
-    ring_B = (X_BR @ ring_R.T).T
-    hidden, near_eye = occludes(bodies, frames, eye, ring_B, config.sight_margin_m)
+    hidden, near_eye = occludes(bodies, frames, eye, points_B, config.sight_margin_m)
     if near_eye < config.scanner_clearance_m:
         return "the arm would come too close to the scanner"
     if hidden:
-        return "the arm hides the flange from the scanner"
-    between = config.surroundings.blocks(eye, ring_B)
-    return f"{between} hides the flange from the scanner" if between else ""
+        return f"the arm hides the {what} from the scanner"
+    between = config.surroundings.blocks(eye, points_B)
+    return f"{between} hides the {what} from the scanner" if between else ""
 
 
 def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:

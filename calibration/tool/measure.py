@@ -234,8 +234,9 @@ def measure_tool(
 
 def _stick_out(nozzle: Nozzle, points: Array, p_FW: Array) -> tuple[float, float]:
     """Return the length of wire beyond the nozzle's mouth, m, and the sigma of the mouth."""
-    mouth, sigma = nozzle.mouth(points, _PROFILE_M)
-    return float((p_FW - nozzle.centre) @ nozzle.axis) - mouth, sigma
+    along, end = (points - nozzle.centre) @ nozzle.axis, float((p_FW - nozzle.centre) @ nozzle.axis)
+    mouth, sigma = nozzle.mouth(points[along < end], _PROFILE_M)  # what lies beyond the wire's end is no nozzle
+    return end - mouth, sigma
 
 
 def _ball(

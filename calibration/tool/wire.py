@@ -14,7 +14,7 @@ from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.source import metric_poses, read_poses
 from weldcal.calibration.errors import ToolNotFound
 from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile, f_tail
-from weldcal.calibration.geometry.se3 import as_transform, frames_along
+from weldcal.calibration.geometry.se3 import as_transform, frames_along, skew
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -22,6 +22,7 @@ POINT, PLATE = "point", "plate"
 _STEPS = 30
 _NOISE_M = 1e-5  # least deviation of a touch: less than any arm repeats to
 _UNSURE_M = 1e-3  # a choice: a wire point with a larger sigma is none
+_TURN_PER_M = 2.5  # rad, a choice: of a flange's turn over its shift; scan_fit has 5e-5 rad and 2e-5 m
 _CHANCE = 1e-3  # that a good touch is left out
 _LONGEST_M = 2.0  # of a tool
 
@@ -150,6 +151,8 @@ def _solved(touches: Sequence[WireTouch], p: Array, axis: Array, wire_m: float, 
     size = 3 + 3 * len(targets)
     N, e, e_rows = np.eye(size), np.zeros(0), [np.zeros(0)]
     p = np.asarray(p, dtype=float)
+    # a turn of the flange moves the wire's end across its lever only: rows of one deviation
+    even = np.linalg.inv(np.linalg.cholesky(np.eye(3) + _TURN_PER_M**2 * skew(p) @ skew(p).T))
     for _ in range(_STEPS):
         J_rows, e_rows = [], []
         for t in touches:
@@ -158,15 +161,18 @@ def _solved(touches: Sequence[WireTouch], p: Array, axis: Array, wire_m: float, 
             off = np.asarray(t.X_BF @ p) - place[target]
             J = np.zeros((3 if t.feature == POINT else 1, size))
             if t.feature == POINT:
-                J[:, :3], J[:, k : k + 3] = R, -np.eye(3)
-                e_rows.append(off)
+                whole = even @ R.T  # in F
+                J[:, :3], J[:, k : k + 3] = even, -whole
+                e_rows.append(whole @ off)
             else:
                 n = planes[target]
                 lean = float(np.linalg.norm(np.cross(R @ axis, n)))
                 J[0, :3] = n @ R
                 J[0, k : k + 2] = off @ frames_along(n[None])[0][:, :2]
                 J[0, k + 2] = -1.0
-                e_rows.append(np.array([n @ off - 0.5 * wire_m * lean]))
+                weight = 1.0 / np.hypot(1.0, _TURN_PER_M * np.linalg.norm(np.cross(p, n @ R)))
+                J *= weight
+                e_rows.append(weight * np.array([n @ off - 0.5 * wire_m * lean]))
             J_rows.append(J)
         J, e = np.concatenate(J_rows), np.concatenate(e_rows)
         N = J.T @ J

@@ -45,6 +45,8 @@ class ToolFile:
     """A tool of one's own: see docs/tool.md."""
 
     file: str = dc.field(default="", metadata=FILE)
+    # the tool that the simulated arm carries in truth, such as one with a bent torch; empty: that of `file`
+    simulated: str = dc.field(default="", metadata=FILE)
 
 
 @dc.dataclass
@@ -413,13 +415,18 @@ class Scenario:
         """Whether the tool is one that welds."""
         return self.tool == "welding" or isinstance(self.tool, ToolFile)
 
-    def loaded_tool(self) -> LoadedTool | None:
-        """The welding tool from its file; None for pen and none. Raises InputError where the file is no tool's."""
+    def loaded_tool(self, *, simulated: bool = False) -> LoadedTool | None:
+        """The welding tool from its file, or the one that the simulated arm carries; None for pen and none.
+
+        Raises InputError where the file is no tool's.
+        """
         if not self.welds:
             return None
         if isinstance(self.tool, ToolFile) and not isinstance(self.tool.file, str):
             raise InputError("The scenario's tool is welding, pen, none or {file: my_tool.yaml}.")
-        return load_tool(Path(self.tool.file) if isinstance(self.tool, ToolFile) else WELDING)
+        if not isinstance(self.tool, ToolFile):
+            return load_tool(WELDING)
+        return load_tool(Path(self.tool.simulated if simulated and self.tool.simulated else self.tool.file))
 
     def feature_standard(self) -> FlangeStandard:
         """Dimensions of the feature that the scanner measures: the tool's ring, or the arm's flange."""

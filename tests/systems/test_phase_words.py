@@ -11,13 +11,15 @@ from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.jobs.procedure import ENDS, Procedure
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure
+from weldcal.systems.jobs.tool_scan.job import ToolScanProcedure
 from weldcal.systems.jobs.touch.procedure import TouchProcedure
 from weldcal.systems.jobs.weld.sequencer import PHASES
 from weldcal.systems.phase_words import OTHERS, STEPS, TEXT, phase_words
 
 
 @pytest.mark.parametrize(
-    "procedure", [TabletProcedure, MountingProcedure, MotionProcedure, ProfilerProcedure, TouchProcedure]
+    "procedure",
+    [TabletProcedure, MountingProcedure, MotionProcedure, ProfilerProcedure, TouchProcedure, ToolScanProcedure],
 )
 def test_every_phase_of_a_job_has_words(procedure: type[Procedure[Any, Any]]) -> None:
     assert len(procedure.steps) >= 3

@@ -76,6 +76,7 @@ from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerS
 from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
+from weldcal.systems.jobs.tool_scan.job import ToolScanProcedure, ToolScanState
 from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchConfig, TouchPlanner, TouchPlanning
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
@@ -231,6 +232,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
         TouchPlanning(cast("SeamPlanning", None), X, ScannerCorrection(), TouchConfig())
     ),
     TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TOUCH),
+    ToolScanProcedure: lambda: ToolScanProcedure((), Q_HOME),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(
@@ -281,6 +283,16 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "state": TabletState,
     },
     TouchPlanner: {"scan": Scan, "job": JobCommand, "planned_touches": PlannedTouches},
+    ToolScanProcedure: {
+        "position_measured": 6,
+        "settled_goal": 1,
+        "robot_status": UrStatus,
+        "scan": Scan,
+        "hold": 1,
+        "job": JobCommand,
+        "trigger": 1,
+        "state": ToolScanState,
+    },
     TouchProcedure: {
         "position_measured": 6,
         "settled_goal": 1,

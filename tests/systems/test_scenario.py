@@ -167,6 +167,7 @@ profiler_job:
   half_width_mm: 15.0
   maximum_time_s: 300.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
+tool_scan: {result: my-calibration, scans: 9}
 touch:
   result: my-calibration
   points: 5

@@ -91,17 +91,21 @@ def touching(name: str, result: Path, points: int | None = None) -> Scenario:
     scenario = load_scenario(name)
     if not hasattr(scenario, "touch"):
         raise InputError("This installation has no touch job.")
-    calibration = load_result(result)
     scenario.job.calibrate = scenario.job.weld = False
     config = TouchConfig(result=str(result))
     if points is not None:
         config.points = points
     scenario.touch = config
-    if calibration.kinematics_file:
-        folder = result if result.is_dir() else result.parent
-        scenario.corrected_kinematics = str(folder / calibration.kinematics_file)
+    use_kinematics(scenario, result)
     check_scenario(scenario)
     return scenario
+
+
+def use_kinematics(scenario: Scenario, result: Path) -> None:
+    """Let a scenario's arm have the kinematics that belong to a result. Raises InputError for no result."""
+    file = load_result(result).kinematics_file
+    if file:
+        scenario.corrected_kinematics = str((result if result.is_dir() else result.parent) / file)
 
 
 def run_touches(scenario: Scenario, options: RunOptions, progress: Progress) -> LiveTouches:

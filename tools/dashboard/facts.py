@@ -19,6 +19,7 @@ from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import PLANS
 from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.jobs.tool_scan.job import AddedToolScan
 from weldcal.systems.jobs.touch.job import AddedTouches
 from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.jobs.touch.procedure import Felt
@@ -31,6 +32,7 @@ from weldcal.systems.phase_words import (
     PROFILER_STEPS,
     STEPS,
     TABLET_STEPS,
+    TOOL_SCAN_STEPS,
     TOUCH_STEPS,
     WATCH_STEPS,
 )
@@ -122,6 +124,8 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
         touch = cell.scenario.part(TouchConfig)
         press_mm = math.nan if touch is None else touch.press_mm
         return facts(steps=TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m)
+    if isinstance(job, AddedToolScan):
+        return facts(steps=TOOL_SCAN_STEPS, maximum_scans=len(job.views))
     if isinstance(job, AddedProfilerJob):
         keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
         return facts(steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys))

@@ -74,6 +74,18 @@ def test_the_wire_is_found_by_points_and_plates(points: int, plates: int, median
     assert 1.6 < np.mean(squares) < 4.6  # 3 is right; four times is far outside
 
 
+def test_the_region_is_wider_across_a_long_tool_than_along_it() -> None:
+    """The flange's turns move the wire's end across its lever only; without their rows the ratio is 1.5."""
+    squares = []
+    for seed in range(300):
+        rng = np.random.default_rng([seed, 5])
+        t = Truth(np.array([0.0, 0.0, 0.6]), UP, torches.BALL, 0.012)
+        wire = find_wire([touch(f"t{k}", "point", t, rng, k, 12) for k in range(12)], t.p_FW, UP, torches.WIRE_M)
+        squares.append((wire.p_FW - t.p_FW) ** 2 / np.diag(wire.covariance))
+    x, y, z = np.mean(squares, axis=0)
+    assert 0.8 < 0.5 * (x + y) / z < 1.38
+
+
 def test_a_touch_that_slipped_is_left_out() -> None:
     touches, t = touched(3, 12, 0)
     touches[5] = replace(touches[5], X_BF=touches[5].X_BF @ RigidTransform([0.0, 0.002, 0.0]))

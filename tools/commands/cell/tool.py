@@ -1,14 +1,16 @@
-"""weldcal tool check: draws a tool; weldcal tool measure: measures it by scans of a calibrated cell and by touches."""
+"""weldcal tool check: draws a tool; weldcal tool measure: measures it by scans, also of its own arm, and touches."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.tool.comparison import (
     EXCEEDED,
@@ -23,11 +25,16 @@ from weldcal.calibration.tool.measure import Move, NozzlePart, ToolMeasurement, 
 from weldcal.calibration.tool.wire import read_wire_touches
 from weldcal.models.errors import InputError
 from weldcal.models.tools.loading import check_sight, load_tool, tool_file
+from weldcal.systems.jobs.tool_scan.planner import FEWEST, MOST, ToolScanConfig, check_tool_scan
+from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import WeldingConfig
+from weldcal.systems.scenario.schema import Scenario, WeldingConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.commands.run import run_job
+from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 
 MEASURED_TOOL = "tool_measurement.json"
@@ -38,6 +45,10 @@ TouchesOption = Annotated[
 CalibrationOption = Annotated[Path | None, option("--calibration", "RESULT", "Result of weldcal calibrate: X_BC.")]
 SeamOption = Annotated[
     str | None, option("--scenario", "NAME", "Scenario with welding.tolerance_mm.", show_default="the usual tolerance")
+]
+CellOption = Annotated[
+    str | None,
+    option("--scenario", "NAME", "Without DATASET: the cell whose arm shows its tool. With it: welding.tolerance_mm."),
 ]
 NozzleOption = Annotated[
     float, option("--nozzle-mm", "MM", "Length of the nozzle that is fitted, from its mouth.", min=15.0, max=300.0)
@@ -93,33 +104,55 @@ def tool_check(
     )
 
 
-@command("tool measure", short_help="Measure the torch by scans and touches.")
+@command(
+    "tool measure",
+    options=("browser", "share"),
+    defaults={"browser": False},
+    short_help="Measure the torch by scans and touches.",
+)
 def tool_measure(
     call: Call,
     dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="Scans of the tool from several sides, poses X_BF.")
-    ],
-    calibration: Annotated[Path, option("--calibration", "RESULT", "Result of weldcal calibrate: X_BC.")],
-    tool: Annotated[Path, option("--tool", "FILE", "Tool file: where the torch should be, or the name of a tool.")],
+        Path | None, typer.Argument(metavar="DATASET", help="Scans of the tool from several sides, poses X_BF.")
+    ] = None,
+    calibration: CalibrationOption = None,
+    tool: Annotated[
+        Path | None, option("--tool", "FILE", "Tool file: where the torch should be, or the name of a tool.")
+    ] = None,
     touches: TouchesOption = None,
-    scenario: SeamOption = None,
+    scenario: CellOption = None,
+    robot: Annotated[
+        str, option("--robot", "NAME", "Without DATASET: simulated, emulated or a controller's address.")
+    ] = "simulated",
+    scans: Annotated[
+        int | None, option("--scans", "N", "Without DATASET: scans of the nozzle.", min=FEWEST, max=MOST)
+    ] = None,
     nozzle_mm: NozzleOption = NOZZLE_MM,
     wire_mm: WireOption = WIRE_MM,
 ) -> Outcome:
     """Measure nozzle, tip and ring by scans of a calibrated cell and the wire's end by touches.
 
-    The result is a new tool file with the measured torch.
+    Without DATASET the arm of --scenario shows its tool to the fixed scanner from all sides. The result is a new tool
+    file with the measured torch.
     """
-    order = MeasureOrder(
-        dataset=dataset,
-        calibration=calibration,
-        tool=tool_file(tool),
-        touches=touches,
-        scenario=scenario,
-        nozzle_mm=nozzle_mm,
-        wire_mm=wire_mm,
+    order = partial(MeasureOrder, touches=touches, scenario=scenario, nozzle_mm=nozzle_mm, wire_mm=wire_mm)
+    if dataset is None:
+        if scenario is None:
+            raise typer.BadParameter("give a folder of scans, or a cell whose arm takes them (--scenario NAME)")
+        if tool is not None:
+            raise typer.BadParameter("--tool belongs to DATASET: the scenario names its tool")
+        showing = showing_tool(scenario, calibration, scans)
+        options = RunOptions(
+            scenario=scenario, out=call.folder("tool-measure", scenario), seed=call.seed, robot=robot, **call.live
+        )
+        return run_tool_scan(showing, options, order, call.progress)
+    if calibration is None or tool is None:
+        raise typer.BadParameter("scans need --calibration RESULT and --tool FILE")
+    report = run_measurement(
+        order(dataset=dataset, calibration=calibration, tool=tool_file(tool)),
+        call.folder("tool-measure", dataset.resolve().name),
+        call.progress,
     )
-    report = run_measurement(order, call.folder("tool-measure", dataset.resolve().name), call.progress)
     return Outcome(report.summary(), values={}, rows=report.rows())
 
 
@@ -247,6 +280,72 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
     write_atomic(folder / "report.html", page)
     write_json(folder / MEASURED_TOOL, report.summary())
     return report
+
+
+def showing_tool(name: str, calibration: Path | None, scans: int | None = None) -> Scenario:
+    """Return a scenario as one whose arm shows its tool to the scanner of a calibration; None: of its tool_scan.
+
+    Raises:
+        InputError: the scanner is not fixed, or the result cannot be used.
+    """
+    scenario = load_scenario(name)
+    if not hasattr(scenario, "tool_scan"):
+        raise InputError("This installation has no tool scan.")
+    config = scenario.part(ToolScanConfig) or ToolScanConfig()
+    result = Path(config.result) if calibration is None else calibration
+    if result == Path():
+        raise InputError("The tool is scanned with a calibrated scanner: give --calibration RESULT.")
+    scenario.tool_scan = replace(config, result=str(result), scans=scans or config.scans)
+    scenario.job.calibrate = scenario.job.weld = False
+    check_tool_scan(scenario)  # first: its sentences name this job
+    use_kinematics(scenario, result)
+    check_scenario(scenario)
+    return scenario
+
+
+def run_tool_scan(
+    scenario: Scenario, options: RunOptions, order: Callable[..., MeasureOrder], progress: Callable[[str, float], None]
+) -> Outcome:
+    """Let the arm show its tool, write the scans as a dataset, and measure the tool by them.
+
+    Raises:
+        InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
+    """
+    finished = run_job(scenario, options, progress, "tool_scan")
+    run, folder, scanner, loaded = (
+        finished.run,
+        options.out / "scans",
+        scenario.scanner_config(),
+        scenario.loaded_tool(),
+    )
+    poses, config = run.cell.job.poses(run.root), scenario.part(ToolScanConfig)
+    assert scanner is not None
+    assert loaded is not None
+    assert config is not None
+    preset = scanner.scanner()
+    if poses:
+        save_dataset(
+            folder,
+            DatasetHeader(
+                robot=scenario.arm,
+                flange=scenario.flange_name(),
+                scanner=preset.name,
+                configuration="eye_on_base",
+                note=f"scans of the tool; robot: {finished.robot}",
+            ),
+            {id: X_BF for id, (X_BF, _) in poses.items()},
+            {id: run.scans[id][0].points_C.astype(float) for id in poses},
+            joints={id: q for id, (_, q) in poses.items()},
+            intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
+        )
+    finished.write_recording(options.out)
+    about = {"scenario": options.scenario, "seed": options.seed, "scans": len(poses), "dataset": str(folder)}
+    if run.held:
+        held = {"state": "held", "reason": run.reason or ""}
+        return Outcome(held | about | run.timing(), values={}, problem=run.reason or "")
+    asked = order(dataset=folder, calibration=Path(config.result), tool=loaded.file)
+    report = run_measurement(asked, options.out, lambda stage, share: progress(stage, 0.9 + 0.1 * share))
+    return Outcome(report.summary() | about | run.timing(), values={}, rows={"scans": str(len(poses)), **report.rows()})
 
 
 def _mm(p: Any) -> list[float]:
