@@ -1,7 +1,8 @@
 """A whole order by wire with one command: three seams, root and cap, tacks, schedule, a measured torch, and the record.
 
-python -m tests.scenario.whole_order FOLDER [--seed N] [--analog] [--welding "{between_seams: direct}"]
+python -m tests.scenario.whole_order FOLDER [--seed N] [--shown] [--analog] [--welding "{between_seams: direct}"]
 plays the devices with `weldcal emulate-cell`, runs `weldcal weld`, and prints what the world knows of torch and part.
+The torch is measured by a generator's scans and touches, or (--shown) by `weldcal tool measure` with the cell's own arm.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ import numpy as np
 import yaml
 
 from tests.calibration.tool.torches import Wrong, cell
+from weldcal.calibration.data.results import CalibrationResult, save_result
 from weldcal.calibration.tool.comparison import measured_file, tool_text
 from weldcal.calibration.tool.measure import measure_tool
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.models.workpieces.reading import read_shape
-from weldcal.systems.scenario.loading import SCENARIO_FOLDER
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.tools.emulators.cell.process import CELL, PLAYED_HOST, PLAYED_SCANS, WORLD, X_BC, played_world
 from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
@@ -47,6 +49,23 @@ def tools(folder: Path, seed: int) -> None:
     (folder / "true.yaml").write_text(yaml.safe_dump(measured_file(true)), encoding="utf-8")
 
 
+def shown(folder: Path, order: Path) -> None:
+    """Let the cell's arm show its tool to its scanner; measured.yaml is what that finds, from the shipped tool file."""
+    scenario = load_scenario(str(order))
+    assert scenario.job.X_BC is not None
+    covariance = np.diag(np.repeat([1e-4, 5e-5], 3) ** 2)
+    pose = scenario.job.X_BC.pose()
+    result = CalibrationResult(X_BC=pose, covariance=covariance, held_out_mm={}, tilt_deg={}, poses=())
+    save_result(result, folder / "result")
+    before = folder / "before.yaml"
+    before.write_text(order.read_text("utf-8").replace(str(folder / "measured.yaml"), str(WELDING)), encoding="utf-8")
+    command = ["tool", "measure", "--scenario", str(before), "--calibration", str(folder / "result")]
+    command += ["--robot", PLAYED_HOST, "--out", str(folder / "shown"), "--overwrite"]
+    print("weldcal", *command, flush=True)
+    subprocess.run([sys.executable, "-m", "weldcal.tools", *command], check=True)
+    (folder / "measured.yaml").write_text((folder / "shown/tool.yaml").read_text("utf-8"), encoding="utf-8")
+
+
 def part(folder: Path) -> list[dict[str, list[int]]]:
     """Write a block on a plate, two solids; its three seams that the arm reaches."""
     write_step(assembly(box((-90, -70, -15), (180, 140, 15)), box((-40, -30, 0), (80, 60, 40))), folder / "part.step")
@@ -69,7 +88,13 @@ def texts(folder: Path, more: dict[str, Any], *, analog: bool) -> tuple[str, str
     home = "home_deg:" + wires.split("home_deg:")[1]
     wires = wires.split("workpiece:")[0].replace("pace: 0.5", "pace: 1.0") + home
     wires = wires.replace("  arc_input: 0\n  arc_fault_input: 1\n", "  arc_input: 0\n" + ANALOG if analog else "")
-    order = {"order": "4711", "wps": "WPS-135-07 rev. B", "part": "block on plate", "serial": "1", "operator": "ak"}
+    order: dict[str, Any] = {
+        "order": "4711",
+        "wps": "WPS-135-07 rev. B",
+        "part": "block on plate",
+        "serial": "1",
+        "operator": "ak",
+    }
     order |= {"limits": {"heat_input_kJ_mm": [0.1, 2.0], "speed_mm_s": [7.0, 9.0], "path_mm": 0.5}}
     welding: dict[str, Any] = {
         "order": order,
@@ -105,6 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--shown", action="store_true", help="the torch is measured by scans that the cell's arm takes")
     parser.add_argument("--analog", action="store_true", help="the schedule by analog outputs, not by Modbus")
     parser.add_argument("--welding", default="{}", metavar="YAML", help="more keys of the cell's part `welding`")
     words = parser.parse_args()
@@ -116,6 +142,8 @@ def main() -> None:
     order = folder / "cell.yaml"
     order.write_text(wires, encoding="utf-8")
     with played_world(folder, world, wires, words.seed) as played:
+        if words.shown:
+            shown(folder, order)
         command = [sys.executable, "-m", "weldcal.tools", "weld", str(order), "--out", str(folder / "out")]
         print("weldcal", *command[3:], flush=True)
         answer = subprocess.run([*command, "--overwrite"], check=False)
