@@ -23,7 +23,7 @@ from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.profilers import make_scene
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.render import csv_text
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "aubo_i5", "franka_fr3")
 REACH_M = {"ur3e": 0.5, "ur5e": 0.85, "ur10e": 1.3, "ur16e": 0.9, "ur20": 1.75, "aubo_i5": 0.88, "franka_fr3": 0.85}

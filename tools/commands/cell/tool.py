@@ -26,8 +26,7 @@ from weldcal.models.tools.loading import check_sight, load_tool, tool_file
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import WeldingConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.files import write_json
-from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.render import render, write_atomic, write_json
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 
 MEASURED_TOOL = "tool_measurement.json"
