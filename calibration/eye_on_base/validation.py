@@ -7,13 +7,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, sigma_at
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.solve import (
-    CalibrationEstimate,
-    SolveConfig,
-    estimate_eye_on_base,
-    point_error_covariance,
-)
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import t_quantile
 from weldcal.calibration.planning.observability import has_orientations, turn_deg
@@ -249,11 +245,6 @@ def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
     corners = middle + 1.5 * np.vstack([reach, -reach])
     errors = [sigma_at(estimate, c) for c in corners]
     return np.asarray(corners[int(np.argmax(errors))])
-
-
-def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
-    """Return the standard deviation (3-D, m) of a scanned point at ``p_BQ`` (3,) m."""
-    return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BQ))))
 
 
 def _direction(axis: Array) -> str:

@@ -20,16 +20,10 @@ from weldcal.calibration.data.results import (
     export_ros2,
     matrix4,
 )
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.eye_on_base.stated_error import USUAL_SCALE, ErrorBudget, error_budget
-from weldcal.calibration.eye_on_base.validation import (
-    Convergence,
-    bootstrap_interval,
-    mean_interval,
-    sigma_at,
-    weakest_place,
-)
+from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval, weakest_place
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation

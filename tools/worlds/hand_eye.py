@@ -16,6 +16,7 @@ from weldcal.calibration.geometry.se3 import (
     nearest_rotation,
     pose,
     random_rotations,
+    scaled,
 )
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
@@ -277,12 +278,6 @@ def _motion(kind: str, rng: np.random.Generator) -> Array:
     return pose(exp_rotation(rng.normal(size=(n, 3)) * spread), p)
 
 
-def _scaled(X: Array, s: float) -> Array:
-    out = X.copy()
-    out[:, :3, 3] *= s
-    return out
-
-
 def _transposed(X: Array) -> Array:
     return pose(np.swapaxes(X[:, :3, :3], 1, 2), X[:, :3, 3])
 
@@ -296,9 +291,9 @@ _MISTAKES: dict[str, Callable[[Array, Array, np.random.Generator], tuple[Array, 
     "none": lambda A, B, _: (A, B),
     "robot inverted": lambda A, B, _: (inverse(A), B),
     "camera inverted": lambda A, B, _: (A, inverse(B)),
-    "millimetres": lambda A, B, rng: (_scaled(A, 1e3), B) if rng.uniform() < 0.5 else (A, _scaled(B, 1e3)),
+    "millimetres": lambda A, B, rng: (scaled(A, 1e3), B) if rng.uniform() < 0.5 else (A, scaled(B, 1e3)),
     "transposed": lambda A, B, rng: (_transposed(A), B) if rng.uniform() < 0.5 else (A, _transposed(B)),
     "quaternion order": lambda A, B, rng: (_xyzw(A), B) if rng.uniform() < 0.5 else (A, _xyzw(B)),
-    "scale": lambda A, B, rng: (A, _scaled(B, float(np.exp(rng.uniform(0.7, 2.3) * rng.choice([-1.0, 1.0]))))),
-    "target size": lambda A, B, rng: (A, _scaled(B, 1.0 + float(rng.uniform(0.02, 0.1) * rng.choice([-1.0, 1.0])))),
+    "scale": lambda A, B, rng: (A, scaled(B, float(np.exp(rng.uniform(0.7, 2.3) * rng.choice([-1.0, 1.0]))))),
+    "target size": lambda A, B, rng: (A, scaled(B, 1.0 + float(rng.uniform(0.02, 0.1) * rng.choice([-1.0, 1.0])))),
 }
