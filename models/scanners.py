@@ -217,21 +217,9 @@ def _read(path: Path, changed: int) -> ScannerPreset:
     )
 
 
-@dataclass(frozen=True)
-class DrakeIntrinsics:
-    """What Drake's CameraInfo takes: focal lengths and principal point in pixels, image corner at (0, 0)."""
-
-    width: int
-    height: int
-    focal_x: float
-    focal_y: float
-    center_x: float
-    center_y: float
-
-
-def drake_intrinsics(preset: ScannerPreset) -> DrakeIntrinsics:
-    """Return the preset for Drake's RgbdSensor, which samples pixel (u, v) at (u + 0.5, v + 0.5): half a pixel more."""
-    return DrakeIntrinsics(preset.width, preset.height, preset.fx, preset.fy, preset.cx + 0.5, preset.cy + 0.5)
+def drake_intrinsics(preset: ScannerPreset) -> tuple[int, int, float, float, float, float]:
+    """Return the arguments of Drake's CameraInfo: its RgbdSensor samples pixel (u, v) at (u + 0.5, v + 0.5)."""
+    return preset.width, preset.height, preset.fx, preset.fy, preset.cx + 0.5, preset.cy + 0.5
 
 
 def _by_area(
@@ -321,8 +309,12 @@ def is_scanner_file(name: str) -> bool:
     return name.lower().endswith((".yaml", ".yml"))
 
 
-def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
+def get_scanner(
+    name: str, width: int | None = None, height: int | None = None, field_of_view_deg: float | None = None
+) -> ScannerPreset:
     """Return the named scanner, or that of a file (.yaml), resized when a width (and height) is given.
+
+    A horizontal field of view keeps the pixels' aspect ratio.
 
     Raises InputError that names the known scanners, or what is wrong in the file.
     """
@@ -336,8 +328,12 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
     if width is None:
         if height is not None:
             raise InputError("A scanner is resized by its width: give the width too, or omit the height.")
+    else:
+        preset = preset.resized(width, height)
+    if field_of_view_deg is None:
         return preset
-    return preset.resized(width, height)
+    fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * field_of_view_deg))
+    return replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
 
 
 def apply_noise(

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.models.result_files import UNFINISHED
+from weldcal.models.files import UNFINISHED
 from weldcal.tools.worlds.doctor import write_cell
 
 STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does

@@ -24,8 +24,7 @@ from weldcal.calibration.data.cloud_files.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, decoded, read_text
-from weldcal.models.result_files import write_npz
+from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, decoded, read_text, write_npz
 
 __all__ = [
     "NO_NOTES",

@@ -48,8 +48,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import sha256
-from weldcal.models.result_files import require_whole, whole_result, write_atomic
+from weldcal.models.files import require_whole, sha256, whole_result, write_atomic
 
 JOINTS = tuple(f"q{k}" for k in range(1, 7))
 SECOND_JOINTS = tuple(f"second_q{k}" for k in range(1, 7))

@@ -28,8 +28,7 @@ from weldcal.calibration.geometry.se3 import pose
 from weldcal.models.arms.chain import chain_poses, is_urdf
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, sha256
-from weldcal.models.result_files import require_whole, whole_result, write_atomic
+from weldcal.models.files import LARGEST_NUMBER, require_whole, sha256, whole_result, write_atomic
 from weldcal.models.robots import ROBOTS, get_chain, get_robot
 
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")

@@ -13,13 +13,18 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_document
-from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_from_document
+from weldcal.calibration.data.scanner_correction import (
+    TERMS,
+    ScannerClock,
+    ScannerCorrection,
+    clock_from_document,
+    correction_from_document,
+)
 from weldcal.calibration.geometry.se3 import as_transform, rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import DocumentSection, read_document, shown
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import require_whole, write_atomic
+from weldcal.models.files import require_whole, write_atomic
 
 ON_BASE = "eye_on_base"
 RESULT_FILE = "calibration.yaml"

@@ -15,7 +15,7 @@ import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.lists import ARRAYS, TREES, read_lists
-from weldcal.calibration.data.poses.names import MOUNTINGS, mounting_name
+from weldcal.calibration.data.poses.names import MOUNTINGS, last_key, mounting_name
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.text import lists_of_text
@@ -135,20 +135,16 @@ def _chosen(lists: list[Listing], name: str, pose: str | None) -> Listing:
         )
     known = ", ".join(one.name.removeprefix(f"{name}, ") for one in single[:8])
     if pose is not None:
-        match = [one for one in single if pose == _key(one.name)] or [one for one in single if pose in one.name]
+        match = [one for one in single if pose == last_key(one.name)] or [one for one in single if pose in one.name]
         if len(match) != 1:
             raise DatasetError(f"--pose {pose} names {len(match)} of the poses of '{name}': {known}.")
         return match[0]
     if len(single) > 1:
-        named = [one for one in single if _NAMED.search(_key(one.name))]
+        named = [one for one in single if _NAMED.search(last_key(one.name))]
         if len(named) != 1:
             raise DatasetError(f"'{name}' holds {len(single)} poses: {known}. Name the camera's with --pose.")
         return named[0]
     return single[0]
-
-
-def _key(name: str) -> str:
-    return re.split(r"[/,\s]+", name)[-1]
 
 
 def _contents(path: Path) -> tuple[list[Listing], _Own]:

@@ -11,11 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.checks import read_rows
+from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.eye_on_base.observations import FlangeObservations
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.files import write_apart
+from weldcal.models.flanges import FlangeStandard
+from weldcal.models.scanners import get_scanner
 
 Which = NDArray[np.bool_] | NDArray[np.int64]
 
@@ -159,6 +164,34 @@ def case_of(
         near_far=near_far,
         oriented=oriented,
     )
+
+
+def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> DoctorCase:
+    """What a dataset shows of the flange, as the doctor examines it."""
+    X_BC, guess = data.X_BC_guess, data.header.scanner_guess
+    try:
+        preset = get_scanner(data.header.scanner)
+        near_far = preset.near_m, preset.far_m
+    except InputError:
+        near_far = None
+    return case_of(
+        seen.observations,
+        seen.fits,
+        np.eye(4) if data.pairs else data.X_FR.GetAsMatrix4(),
+        robot=data.header.robot,
+        flange=stated.designation,
+        refused=seen.refused,
+        guess=None if X_BC is None else X_BC.GetAsMatrix4(),
+        guess_radius=0.06 if guess is None else guess.radius_m,
+        oriented=not data.pairs or all(p.has_orientation for p in data.pairs),
+        fits_flange=found.designation,
+        near_far=near_far,
+    )
+
+
+def write_case(folder: Path, case: DoctorCase) -> None:
+    """Write the flange of each scan beside a result, for `weldcal doctor`."""
+    write_apart(folder / NAME, case_text(case))
 
 
 def case_text(case: DoctorCase) -> str:

@@ -72,6 +72,11 @@ def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
     return np.asarray(J @ estimate.joint @ J.T)
 
 
+def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
+    """Return the standard deviation (3-D, m) of a scanned point at ``p_BQ`` (3,) m."""
+    return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BQ))))
+
+
 def with_scanner(
     estimate: CalibrationEstimate,
     scanner: ScannerCorrection,

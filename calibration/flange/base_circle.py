@@ -10,8 +10,7 @@ from weldcal.calibration.flange.edge_labels import RayModel, refine_circle
 from weldcal.calibration.flange.face import coverage, plane_axes
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess
 from weldcal.calibration.flange.search import window_about
-from weldcal.calibration.geometry.circle import CircleFit, fit_circle
-from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes
+from weldcal.calibration.geometry.primitives import CircleFit, PlaneFit, fit_circle, fit_plane, local_planes
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.geometry.circle import CircleFit
+from weldcal.calibration.geometry.primitives import CircleFit
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
 

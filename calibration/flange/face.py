@@ -8,8 +8,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.geometry.circle import CircleFit, fit_circle
-from weldcal.calibration.geometry.plane import PlaneFit, fit_plane
+from weldcal.calibration.geometry.primitives import CircleFit, PlaneFit, fit_circle, fit_plane
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 

@@ -12,8 +12,7 @@ from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitCo
 from weldcal.calibration.flange.search import search_frame, typical_pitches, window_about
 from weldcal.calibration.flange.track import fit_tracked
 from weldcal.calibration.flange.window import measure_window
-from weldcal.calibration.geometry.circle import fuse
-from weldcal.calibration.geometry.plane import local_planes
+from weldcal.calibration.geometry.primitives import fuse, local_planes
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 

@@ -10,7 +10,7 @@ from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.search import typical_pitches, window_about
-from weldcal.calibration.geometry.circle import CircleFit, refine_circles
+from weldcal.calibration.geometry.primitives import CircleFit, refine_circles
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 

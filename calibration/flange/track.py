@@ -19,8 +19,7 @@ from weldcal.calibration.flange.face import (
     plane_axes,
     thickness,
 )
-from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
+from weldcal.calibration.geometry.primitives import CircleFit, PlaneFit, plane_steps, refine_circles, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled

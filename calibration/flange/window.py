@@ -20,8 +20,7 @@ from weldcal.calibration.flange.face import (
     plane_axes,
     thickness,
 )
-from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
+from weldcal.calibration.geometry.primitives import CircleFit, PlaneFit, fit_plane, refine_circles, shared_noise
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard

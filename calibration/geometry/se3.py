@@ -61,6 +61,13 @@ def as_transform(X: Array) -> RigidTransform:
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
+def scaled(X: Array, factor: float) -> Array:
+    """Return poses (n, 4, 4) with their positions multiplied by a factor."""
+    out = X.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
 def angle_of(R: Array) -> Array:
     """Angles (...) rad of rotations (..., 3, 3)."""
     return np.asarray(np.arccos(np.clip(0.5 * (np.einsum("...ii->...", R) - 1.0), -1.0, 1.0)))

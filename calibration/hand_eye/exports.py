@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, export_urdf, matrix4, software_version
 from weldcal.calibration.hand_eye.mountings import Mounting, Unknown
 from weldcal.calibration.hand_eye.solve import HandEyeResult
-from weldcal.models.result_files import write_atomic
+from weldcal.models.files import write_atomic
 
 RESULT_FILE = "hand_eye.yaml"
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
-from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose, scaled
 from weldcal.calibration.hand_eye.pairs.conventions import ReadingAgreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import LEAST_SCALE, SCALE_SIGMA, decided
@@ -66,7 +66,7 @@ def _solvable(one: ReadingAgreement, mode: str) -> bool:
     F = one.robot.X if mode == "eye_in_hand" else inverse(one.robot.X)
     try:
         solve_problem(
-            full_problem(F, _scaled(one.camera.X, one.scale)), config=HandEyeConfig(folds=0, usual_discord_rad=0.0)
+            full_problem(F, scaled(one.camera.X, one.scale)), config=HandEyeConfig(folds=0, usual_discord_rad=0.0)
         )
     except WeldcalError:
         return False
@@ -212,7 +212,7 @@ def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
     Z = np.asarray(result.poses["Z"].GetAsMatrix4()) if "Z" in result.poses else IDENTITY
     state = X, Y, Z
     lin = linearise(used, state, np.zeros(3))
-    _, up = residuals(replace(used, G=_scaled(used.G, 1.0 + _STEP)), state)
+    _, up = residuals(replace(used, G=scaled(used.G, 1.0 + _STEP)), state)
     column = (up - lin.d)[:, :, None] / _STEP
     Jd = np.concatenate([lin.Jd, column], axis=2).reshape(-1, problem.size + 1)
     Jw = np.concatenate([lin.Jw, np.zeros_like(column)], axis=2).reshape(-1, problem.size + 1)
@@ -229,9 +229,3 @@ def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
         " for the robot's motion; check the size of the target and the camera's focal length: an error of either"
         " shifts the result."
     )
-
-
-def _scaled(X: Array, s: float) -> Array:
-    out = X.copy()
-    out[:, :3, 3] *= s
-    return out

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_correction import DEVICE, ScannerClock
 from weldcal.calibration.errors import InconsistentPoses, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.clock_fit import DRIFT, EDGE, OFFSET, ROLLING, TARGET, ClockFit, fit_clock

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.scanner_clock import ARRIVAL, DEVICE
+from weldcal.calibration.data.scanner_correction import ARRIVAL, DEVICE
 from weldcal.models.arrays import Array
 
 _MOST_LACKING = 0.2  # of the frames may have no device time; those are left out then

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_correction import DEVICE, ScannerClock
 from weldcal.calibration.motion.clock_fit import DRIFT, OFFSET, ClockFit, fit_clock
 from weldcal.calibration.motion.observed import FrameClock, ObservedFrames, choose_clock
 from weldcal.calibration.motion.start import EARLIEST_S, LATEST_S

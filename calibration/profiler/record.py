@@ -19,7 +19,7 @@ from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.calibration.profiler.sphere.model import corrected
 from weldcal.models.documents import DocumentSection, read_document
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import require_whole, write_atomic
+from weldcal.models.files import require_whole, write_atomic
 
 RECORD_FILE = "profiler.yaml"
 JSON_FILE = "X_FS.json"

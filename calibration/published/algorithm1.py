@@ -120,16 +120,15 @@ class VerificationError:
 
     ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
     frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
-    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``unobservable``
-    names the components (of COMPONENTS) for which nothing was seen that could show them: they count as zero in
-    ``value`` and in ``X_CpC``, and `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone
-    does to each, infinite where unobservable.
+    None. ``fitness`` (0..1) is the share of points that found a partner. ``unobservable`` names the components (of
+    COMPONENTS) for which nothing was seen that could show them: they count as zero in ``value`` and in ``X_CpC``, and
+    `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone does to each, infinite where
+    unobservable.
     """
 
     value: Array
     X_CpC: RigidTransform | None
     fitness: float
-    rmse_m: float
     unobservable: tuple[str, ...] = ()
     sigma: Array | None = None
 
@@ -150,7 +149,7 @@ class VerificationError:
         )
 
 
-FAILED = VerificationError(np.full(6, np.inf), None, 0.0, float("inf"))
+FAILED = VerificationError(np.full(6, np.inf), None, 0.0)
 
 
 class Verifier(Protocol):
@@ -195,7 +194,7 @@ class CentreVerification:
         in_R = o.X_BR.rotation().inverse() @ error_B
         correction = RigidTransform(-(X_BC.rotation().inverse() @ error_B))
         value = np.concatenate([np.zeros(3), in_R])
-        return VerificationError(value, correction, 1.0, float(np.linalg.norm(error_B)), COMPONENTS[:3])
+        return VerificationError(value, correction, 1.0, COMPONENTS[:3])
 
 
 def make_verification(
@@ -261,8 +260,7 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
     value[[name in unobservable for name in COMPONENTS]] = 0.0
     correction = X_RC.inverse() @ RigidTransform(RotationMatrix(exp_rotation(value[:3])), value[3:]).inverse() @ X_RC
-    rmse = float(np.sqrt(np.mean(np.sum((matched - verification.model_R[pairs[:, 1]]) ** 2, axis=1))))
-    return VerificationError(value, correction, float(result.fitness), rmse, unobservable, sigmas(matrix, noise))
+    return VerificationError(value, correction, float(result.fitness), unobservable, sigmas(matrix, noise))
 
 
 def registered(points: Array, model: Array, normals: Array, reach: float, method: Method) -> Any:

@@ -179,7 +179,7 @@ def published_icp(X_BC: RigidTransform, verification: PublishedVerification) -> 
     R = RotationMatrix.ProjectToRotationMatrix(T[:3, :3])
     e = RigidTransform(R, unit * T[:3, 3])
     value = np.concatenate([RollPitchYaw(R).vector(), e.translation()])
-    return VerificationError(value, e, float(result.fitness), unit * float(result.inlier_rmse))
+    return VerificationError(value, e, float(result.fitness))
 
 
 def find_centres(

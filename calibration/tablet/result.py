@@ -18,8 +18,7 @@ from weldcal.calibration.data.results import (
 )
 from weldcal.models.documents import DocumentSection, as_number, read_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER
-from weldcal.models.result_files import require_whole, write_atomic
+from weldcal.models.files import LARGEST_NUMBER, require_whole, write_atomic
 
 RESULT_FILE = "tablet.yaml"
 _CONFIGURATION = "eye_in_hand_tablet"

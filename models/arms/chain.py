@@ -1,5 +1,6 @@
-"""A serial arm of revolute joints: forward kinematics, Jacobian, and iterative inverse kinematics."""
+"""A serial arm of revolute joints, of our files or a URDF: forward and inverse kinematics, and Jacobian."""
 
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from weldcal.models.arms.kinematics import ArmModel, joint_frames, known_arms, l
 from weldcal.models.arrays import Array
 from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
+from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
 _HERE = Path(__file__).resolve().parent
@@ -21,6 +23,11 @@ _DAMPING = 1e-3
 _STEPS = 150
 _STARTS = 24
 _MAX_STEP_RAD = 0.5
+BASES, FLANGES = ("base", "base_link"), ("tool0", "flange", "ee_link", "link_ee", "hand", "tool_link")
+"""Names of links that are taken for base and flange, the first that is there; otherwise the root, and the end of the
+chain."""
+UNLIMITED_RAD = 2.0 * np.pi  # of a continuous joint
+_PICTURES = ("visual", "collision")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,9 +75,7 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
     if is_urdf(name):
         if not Path(name).is_file():
             raise InputError(f"There is no file '{name}' of an arm.")
-        from weldcal.models.arms.urdf_file import read_urdf_chain  # Drake's parser takes a third of a second to import
-
-        return Chain(name=Path(name).name, **read_urdf_chain(Path(name))._asdict())
+        return read_urdf_chain(Path(name))
     if name in known_arms():
         return chain_of(load_arm(name, kinematics))
     path = _HERE / name / "chain.yaml"
@@ -190,3 +195,104 @@ def _pose(row: dict[str, Any]) -> Array:
     X[:3, :3] = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
     X[:3, 3] = x, y, z
     return X
+
+
+def read_urdf_chain(path: Path) -> Chain:
+    """Return the chain of a URDF file; meshes are not needed.
+
+    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root. The flange is `tool0`
+    or `flange` (z out of it), else the last link.
+
+    Raises:
+        InputError: the file cannot be read, or is no serial arm of revolute joints.
+    """
+    try:
+        robot = ET.fromstring(read_text(path, LARGEST_DOCUMENT))
+    except ET.ParseError as error:
+        raise InputError(f"'{path.name}' is not XML: {error}; make a URDF of a xacro file with xacro first.") from error
+    if robot.tag != "robot" or any("xacro" in (e.tag if isinstance(e.tag, str) else "") for e in robot.iter()):
+        raise InputError(f"'{path.name}' is no URDF: make one of a xacro file with xacro first.")
+    for link in robot.iter("link"):
+        for picture in [e for e in link if e.tag in _PICTURES]:
+            link.remove(picture)  # kinematics needs no meshes, whose files may not be here
+    # Drake's parser takes a third of a second to import
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(time_step=0.0)
+    try:
+        (model,) = Parser(plant).AddModelsFromString(ET.tostring(robot, encoding="unicode"), "urdf")
+        above = {plant.get_joint(i).child_body().name(): plant.get_joint(i) for i in plant.GetJointIndices(model)}
+        bodies = {plant.get_body(i).name(): plant.get_body(i) for i in plant.GetBodyIndices(model)}
+        for name in bodies.keys() - above.keys():
+            plant.WeldFrames(plant.world_frame(), bodies[name].body_frame())
+        plant.Finalize()
+    except Exception as error:  # Drake raises RuntimeError for most, and other types
+        raise InputError(f"'{path.name}' cannot be read as a URDF: {' '.join(str(error).split())[:200]}") from error
+    base, flange = _base(bodies, above), _flange(path, bodies, above)
+    joints = _between(path, base, flange, above)
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    X_WB = bodies[base].EvalPoseInWorld(context)
+    stack, before = [], X_WB
+    for joint in joints:
+        axis = joint.frame_on_child().CalcPoseInWorld(context)
+        z = np.asarray(joint.revolute_axis())
+        turn = RotationMatrix() if z[2] > 1.0 - 1e-12 else RotationMatrix.MakeFromOneVector(z, 2)
+        X = axis @ RigidTransform(turn, np.zeros(3))
+        stack.append((before.inverse() @ X).GetAsMatrix4())
+        before = X
+    X_LF = before.inverse() @ bodies[flange].EvalPoseInWorld(context)
+    low, high, speed = (
+        np.array([float(getattr(j, limit)()[0]) for j in joints])
+        for limit in ("position_lower_limits", "position_upper_limits", "velocity_upper_limits")
+    )
+    return Chain(
+        name=path.name,
+        joint_names=tuple(j.name() for j in joints),
+        stack=np.array(stack),
+        X_LF=X_LF.GetAsMatrix4(),
+        position_lower=np.where(np.isfinite(low), low, -UNLIMITED_RAD),
+        position_upper=np.where(np.isfinite(high), high, UNLIMITED_RAD),
+        velocity_limit=np.where(np.isfinite(speed), speed, np.pi),
+    )
+
+
+def _base(bodies: dict[str, Any], above: dict[str, Any]) -> str:
+    named = next((name for name in BASES if name in bodies), "")
+    roots = [name for name in bodies if name not in above or above[name].parent_body().name() not in bodies]
+    return named or roots[0]
+
+
+def _flange(path: Path, bodies: dict[str, Any], above: dict[str, Any]) -> str:
+    named = next((name for name in FLANGES if name in bodies), "")
+    if named:
+        return named
+    parents = {joint.parent_body().name() for joint in above.values()}
+    ends = [name for name in bodies if name not in parents]
+    if len(ends) != 1:
+        raise InputError(
+            f"'{path.name}' has {len(ends)} ends ({', '.join(ends[:4])}) and none is called {' or '.join(FLANGES[:2])}:"
+            " name the link of the flange tool0, z out of its face."
+        )
+    return ends[0]
+
+
+def _between(path: Path, base: str, flange: str, above: dict[str, Any]) -> list[Any]:
+    """Return the revolute joints from the base's root to the flange; fixed joints are passed."""
+    found: list[Any] = []
+    name = flange
+    while name in above and name != base:
+        joint = above[name]
+        if joint.type_name() == "revolute":
+            found.append(joint)
+        elif joint.num_positions():
+            raise InputError(
+                f"'{path.name}': joint '{joint.name()}' is {joint.type_name()}; only arms of revolute joints are known."
+            )
+        name = joint.parent_body().name()
+    if len(found) < 3:
+        raise InputError(
+            f"'{path.name}' has {len(found)} revolute joints between '{base}' and '{flange}': an arm has three or more."
+        )
+    return found[::-1]

@@ -116,7 +116,7 @@ def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: T
 
 def add_tool(
     plant: MultibodyPlant, arm: ModelInstanceIndex, tool: WeldingTool, contact_hint_m: float
-) -> tuple[ModelInstanceIndex, tuple[PrismaticJoint, ...]]:
+) -> ModelInstanceIndex:
     """Add the tool's bodies and its ring, welded to the flange, and the soft tip on three sprung prismatic joints."""
     instance = plant.AddModelInstance("tool")
     flange_frame = plant.GetFrameByName("flange", arm)
@@ -136,7 +136,6 @@ def add_tool(
     # mass of grams.
     parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
     small = SpatialInertia(tool.tip_mass_kg / 3, np.zeros(3), UnitInertia.SolidSphere(0.01))
-    joints: list[PrismaticJoint] = []
     body = plate
     for axis, name in enumerate("xyz"):
         body = plant.AddRigidBody(f"tip_{name}", instance, small)
@@ -145,7 +144,6 @@ def add_tool(
         actuator = plant.AddJointActuator(f"tip_{name}", joint)
         stiffness = tool.axial_stiffness_N_per_m if name == "z" else tool.lateral_stiffness_N_per_m
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=tool.damping_N_s_per_m))
-        joints.append(joint)
         parent = body.body_frame()
 
     X_TM = tool.X_TM
@@ -173,7 +171,7 @@ def add_tool(
     )
     rounded = Sphere(radius * CONTACT_MESH_VOLUME ** (-1.0 / 3.0))
     plant.RegisterCollisionGeometry(body, RigidTransform(), rounded, "tip_contact", contact)
-    return instance, tuple(joints)
+    return instance
 
 
 def _fixed_offset(plant: MultibodyPlant, name: str, body: RigidBody, X: RigidTransform) -> FixedOffsetFrame:

@@ -10,8 +10,12 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
-from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.data.scanner_correction import (
+    DEVICE,
+    ScannerClock,
+    ScannerCorrection,
+    correction_from_document,
+)
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
 from weldcal.calibration.motion.drift.watch import drift_config

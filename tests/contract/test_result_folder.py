@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from tests.calibration.hand_eye.poses import eye_in_hand
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import UNFINISHED
+from weldcal.models.files import UNFINISHED
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.result_folder import RUNNING, claimed
 

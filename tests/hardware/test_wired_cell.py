@@ -20,7 +20,7 @@ import pytest
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import VectorLogSink
 
-from weldcal.models.result_files import UNFINISHED
+from weldcal.models.files import UNFINISHED
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.phase_words import phase_words

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.fuzz.damage import _npz_bomb, _objects
 from weldcal.models.array_files import read_grey_image, read_npy, read_npz
 from weldcal.models.documents import DocumentSection, parse_document, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_bytes, read_text, sha256
-from weldcal.tools.worlds.damage import _npz_bomb, _objects
 
 READERS: dict[str, Callable[[Path], object]] = {
     "bytes": read_bytes,

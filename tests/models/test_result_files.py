@@ -16,7 +16,7 @@ import pytest
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import UNFINISHED, require_whole, whole_result, write_atomic, write_npz
+from weldcal.models.files import UNFINISHED, require_whole, whole_result, write_atomic, write_npz
 from weldcal.tools.commands.doctor import examine
 from weldcal.tools.commands.replay import find_pages
 from weldcal.welding.record.weld_log import load_weld_log
@@ -25,7 +25,7 @@ KILLS = 20
 WRITER = """
 import json, signal, sys
 from pathlib import Path
-from weldcal.models.result_files import whole_result, write_atomic
+from weldcal.models.files import whole_result, write_atomic
 def end(*_):
     raise KeyboardInterrupt("SIGTERM")
 signal.signal(signal.SIGTERM, end)
@@ -76,7 +76,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_part_of_the_new(tmp_path: Path) 
     write_atomic(path, "old")
     script = (
         "import resource, signal, sys\nfrom pathlib import Path\n"
-        "from weldcal.models.result_files import whole_result, write_atomic\n"
+        "from weldcal.models.files import whole_result, write_atomic\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
         "path = Path(sys.argv[1])\n"

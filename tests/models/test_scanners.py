@@ -100,13 +100,7 @@ def test_points_of_a_drake_depth_image_lie_on_the_plane_that_was_rendered() -> N
     look.AddProperty("label", "id", RenderLabel(1))
     slab.set_perception_properties(look)
     graph.RegisterAnchoredGeometry(graph.RegisterSource("test"), slab)
-    d = drake_intrinsics(scanner)
-    core = RenderCameraCore(
-        "vtk",
-        CameraInfo(d.width, d.height, d.focal_x, d.focal_y, d.center_x, d.center_y),
-        ClippingRange(0.05, 5.0),
-        RigidTransform(),
-    )
+    core = RenderCameraCore("vtk", CameraInfo(*drake_intrinsics(scanner)), ClippingRange(0.05, 5.0), RigidTransform())
     query = graph.get_query_output_port().Eval(graph.CreateDefaultContext())
     camera = DepthRenderCamera(core, DepthRange(0.1, 4.0))
     depth = query.RenderDepthImage(camera, graph.world_frame_id(), RigidTransform()).data[:, :, 0]

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.places import ROOT
-from weldcal.models.result_files import write_apart
+from weldcal.models.files import write_apart
 from weldcal.systems.jobs.weld.progress_keeper import RESTART, sha256_of
 from weldcal.systems.recording.scenario_files import packed
 from weldcal.systems.scenario.loading import load_scenario

@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from tests.interrupted import KNOWN, QUICK, commands, end_after
-from weldcal.models.result_files import UNFINISHED, whole_result, write_atomic
+from weldcal.models.files import UNFINISHED, whole_result, write_atomic
 from weldcal.tools import console
 from weldcal.tools.worlds.doctor import write_cell
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import whole_result
+from weldcal.models.files import whole_result
 from weldcal.systems.interrupts import work
 from weldcal.tools import console
 from weldcal.tools.cli.result_folder import claimed

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import UNFINISHED
+from weldcal.models.files import UNFINISHED
 
 RUNNING = ".weldcal-running"
 """The file that a folder holds while a command writes there, with the number of its process."""

@@ -1,7 +1,8 @@
 """`weldcal calibrate`: estimates X_BC and its uncertainty from a folder of scans, and writes exports and a report."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,16 +18,16 @@ from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_carried, is_motion
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, IcpRecord, export_all, save_result, software_version
+from weldcal.calibration.doctor.case import FEWEST, dataset_case, write_case
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
-from weldcal.calibration.eye_on_base.observations import fit_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
-from weldcal.calibration.eye_on_base.validation import convergence, k_fold
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold, sampling_advice
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
@@ -34,8 +35,8 @@ from weldcal.calibration.refinement.kinematics_choice import require_joint_angle
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.tools.cli.discovery import on_demand, other_command
 from weldcal.tools.cli.options import (
     MOTION,
@@ -48,7 +49,6 @@ from weldcal.tools.cli.options import (
     option,
     switch,
 )
-from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import (
     Algorithm1Outcome,
@@ -57,9 +57,8 @@ from weldcal.tools.report.calibration import (
     pose_records,
     tilt_summary,
 )
-from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import statistics, write_atomic
+from weldcal.tools.report.render import csv_text, statistics, write_atomic
 
 _CONFIRMING = 3  # hole circles without which the robot's motion alone does not change the scanner
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
@@ -230,7 +229,7 @@ def calibrate_dataset(
     observations, fits, refused = list(seen.observations), seen.fits, list(seen.refused)
     few = len(observations) < ENOUGH
     confirmed = len(seen.patterns) >= _CONFIRMING
-    with examined_where_refused(Path(out), data, seen, standard, seed):
+    with _examined_where_refused(Path(out), data, seen, standard, seed):
         _enough(observations, refused, start)
         steps = Steps(
             patterns=seen.patterns,
@@ -375,6 +374,28 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+@contextmanager
+def _examined_where_refused(
+    out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
+) -> Iterator[None]:
+    """Write the case to ``out`` where the block refuses five scans or more; the error goes on, with its likely cause.
+
+    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be
+    wrong.
+    """
+    try:
+        yield
+    except WeldcalError as problem:
+        if len(seen.observations) < FEWEST and data.header.scanner_guess is not None:
+            anywhere = replace(data, header=replace(data.header, scanner_guess=None))
+            seen = fit_flanges(anywhere, standard, holes=False, seed=seed)
+        if len(seen.observations) >= FEWEST:
+            case = dataset_case(data, seen, standard, standard)
+            write_case(out, case)
+            on_demand("name_cause")(problem, case)
+        raise
 
 
 def _refinement(

@@ -21,10 +21,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, FlangeOption, LimitOption, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report, motion_result
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import csv_text, write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 _MOST_TURNED = 50  # poses whose orientations are compared

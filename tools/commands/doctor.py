@@ -12,19 +12,18 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import NAME, DoctorCase, read_case
+from weldcal.calibration.doctor.case import NAME, DoctorCase, dataset_case, read_case
 from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.errors import InputError
+from weldcal.models.files import require_whole
 from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
-from weldcal.models.result_files import require_whole
 from weldcal.systems.cell import Cell
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, FlangeOption, Outcome, command
 from weldcal.tools.commands.cell.tool import MEASURED_TOOL
-from weldcal.tools.commands.dataset_case import dataset_case
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case

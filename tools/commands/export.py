@@ -20,8 +20,8 @@ from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
+from weldcal.models.files import require_whole, write_atomic
 from weldcal.models.flanges import flange_mesh, get_flange
-from weldcal.models.result_files import require_whole, write_atomic
 from weldcal.models.robots import get_robot
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option, switch

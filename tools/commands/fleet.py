@@ -13,10 +13,9 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.report.files import write_json
 from weldcal.tools.report.first_screen import CARE
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import write_atomic, write_json
 
 HEADER = "dataset.yaml"
 FAILED = "failed"

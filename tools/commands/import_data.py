@@ -22,8 +22,8 @@ from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, 
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.files import write_atomic, write_npz
 from weldcal.models.flanges import get_flange
-from weldcal.models.result_files import write_atomic, write_npz
 from weldcal.tools.cli.options import Call, FlangeOption, Outcome, command
 from weldcal.tools.cli.result_folder import RUNNING
 from weldcal.tools.commands.hand_eye import (
@@ -36,7 +36,7 @@ from weldcal.tools.commands.hand_eye import (
     stated_forms,
 )
 from weldcal.tools.commands.verify_pairs import holds_scans
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.render import csv_text
 
 PAIRS_FILE, TABLE_FILE = "pairs.npz", "table.csv"
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import MotionDataset
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_clock import ARRIVAL
+from weldcal.calibration.data.scanner_correction import ARRIVAL
 from weldcal.calibration.motion.body import BodyModel, fused_model, link_motion, model_from_solids, see_body
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames

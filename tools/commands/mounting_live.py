@@ -43,10 +43,9 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, FlangeOption, LimitOption, Outcome, RecordOption, command, option
 from weldcal.tools.commands.run import JobRun, run_job, run_options
-from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.mounting import MountingReport, RecordedMounting, mounting_report, station_picture
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import csv_text, write_atomic
 from weldcal.tools.report.run import RunOptions
 
 _HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # joints that a dataset does not state are taken near these

@@ -21,7 +21,7 @@ from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_pos
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import write_atomic
+from weldcal.models.files import write_atomic
 from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.jobs.motion.job import MotionJob, plan_corners
@@ -32,7 +32,7 @@ from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.render import csv_text, write_json
 from weldcal.welding.passes.bead import WIDEST_M, bead_area, filling_passes
 
 _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; degrees

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import require_whole
+from weldcal.models.files import require_whole
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.recording.player import Playback

@@ -15,9 +15,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.commands.run import run_job
-from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.first_screen import DO_NOT
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import csv_text, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import TouchReport, touch_page
 

@@ -18,7 +18,7 @@ from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import whole_result
+from weldcal.models.files import whole_result
 from weldcal.systems.cell import Cell
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
@@ -37,8 +37,7 @@ from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
-from weldcal.tools.report.files import write_json
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.tools.report.weld_record import part_record, weld_record

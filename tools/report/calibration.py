@@ -20,14 +20,13 @@ from weldcal.calibration.data.results import (
     export_ros2,
     matrix4,
 )
-from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval
+from weldcal.calibration.eye_on_base.stated_error import USUAL_SCALE, ErrorBudget, error_budget
+from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval, weakest_place
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.budget import USUAL_SCALE, ErrorBudget, error_budget
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, software_version, target_document
-from weldcal.calibration.data.scanner_clock import DEVICE
+from weldcal.calibration.data.scanner_correction import DEVICE
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array

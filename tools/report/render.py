@@ -1,10 +1,14 @@
-"""Renders report templates to self-contained HTML, and formats numbers."""
+"""Writes what a result shows: HTML pages of templates, JSON and CSV files, and numbers."""
 
 import base64
+import csv
 import hashlib
+import io
+import json
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,8 @@ from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
-from weldcal.models.result_files import write_atomic as write_atomic
+from weldcal.models.files import write_atomic as write_atomic
+from weldcal.tools.console import plain
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
 
@@ -195,3 +200,23 @@ def _coloured(found: re.Match[str]) -> str:
     if colour in ("#e3e6e9", "#b0b0b0", "#cccccc"):
         return "var(--line)"
     return f"var(--plot-{_PLOT[colour]})" if colour in _PLOT else found[0]
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write the content, in JSON's own types (what is not finite becomes null), with its folder."""
+    write_atomic(path, json.dumps(plain(content), allow_nan=False, indent=1) + "\n")
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return a header line and one line per row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def mappings_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
+    """Mappings, one line each: these keys, or all."""
+    columns = columns or list(dict.fromkeys(key for row in rows for key in row))
+    return csv_text(columns, ([row.get(name, "") for name in columns] for row in rows))

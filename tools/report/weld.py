@@ -24,7 +24,7 @@ from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEME
 from weldcal.systems.messages import SeamRecord
 from weldcal.systems.runner import Run
 from weldcal.systems.station import Truth
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.render import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics, wire_angles

@@ -16,9 +16,8 @@ from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.runner import Run
-from weldcal.tools.report.files import mappings_csv, write_json
 from weldcal.tools.report.pictures import GREY, OURS, TORCH, plain, subplots, svg
-from weldcal.tools.report.render import fixed, render, write_atomic
+from weldcal.tools.report.render import fixed, mappings_csv, render, write_atomic, write_json
 from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, ordered_angles
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
 from weldcal.welding.record.process import speed_along

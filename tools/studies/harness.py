@@ -35,8 +35,7 @@ from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
 from weldcal.tools.farm.pools import FAILED
 from weldcal.tools.farm.run import Farm, Result
-from weldcal.tools.report.files import csv_text, write_json
-from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.report.render import csv_text, fixed, write_atomic, write_json
 
 _STYLES = {"met": "[green]met[/]", "MISSED": "[bold red]MISSED[/]"}
 

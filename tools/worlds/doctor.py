@@ -18,7 +18,7 @@ from weldcal.models.arms.chain import Chain, chain_poses, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.render import csv_text
 
 ARMS = ("ur10e", "ur5e")
 FLANGE = "iso9409-1-50-4-m6"

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
@@ -26,7 +26,6 @@ from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.jobs.mounting.config import MountingJob
 from weldcal.systems.jobs.mounting.job import mounting_scene, plan_mounting
-from weldcal.systems.jobs.weld.iterative_calibrator import expected_error
 from weldcal.systems.jobs.weld.settings import feature_on_flange, plan_poses, work_point
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
@@ -164,7 +163,7 @@ def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array)
     limits = scenario.calibration
     for n in range(limits.minimum_scans, len(observed) + 1):
         estimate, _ = estimate_jointly(observed[:n])
-        if expected_error(estimate, work) <= 1e-3 * limits.required_error_mm:
+        if sigma_at(estimate, work) <= 1e-3 * limits.required_error_mm:
             break
     return n, estimate
 

@@ -27,7 +27,7 @@ from weldcal.models.robots import get_robot
 from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import write_json
 from weldcal.tools.worlds.moving_arm import (
     MovingScene,
     RigidBody,

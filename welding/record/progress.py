@@ -10,8 +10,7 @@ import numpy as np
 
 from weldcal.models.documents import as_number, parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_TEXT, read_text
-from weldcal.models.result_files import write_durable
+from weldcal.models.files import LARGEST_TEXT, read_text, write_durable
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.restart import Restart
 

@@ -20,8 +20,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.documents import as_number, parse_document, shown
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_TEXT, read_text
-from weldcal.models.result_files import require_whole
+from weldcal.models.files import LARGEST_TEXT, read_text, require_whole
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import WeldProcess
 

@@ -13,6 +13,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.geometry.se3 import scaled
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide
 from weldcal.models.arrays import Array
 
@@ -141,7 +142,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     }
     if how == "by time" or (shift and how):
         notes.append(f"The rows were paired {how}.")
-    metric = [_metric(one.X, factor) for one, (factor, _) in zip((A, B), units, strict=True)]
+    metric = [scaled(one.X, factor) for one, (factor, _) in zip((A, B), units, strict=True)]
     ids = robot.ids or camera.ids
     rows = rows_r if robot.ids else rows_c
     return ImportedPairs(
@@ -159,12 +160,6 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
 def _with_name(listing: Listing, form: PoseForm) -> PoseForm:
     """Return the stated form, inverted where the list's name says so."""
     return replace(form, frame="base_in_flange") if named_inverse(listing) and form.frame == "flange_in_base" else form
-
-
-def _metric(X: Array, factor: float) -> Array:
-    out = X.copy()
-    out[:, :3, 3] *= factor
-    return out
 
 
 def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:

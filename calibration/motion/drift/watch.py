@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_clock import DEVICE
-from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.data.scanner_correction import DEVICE, correction_from_document
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.motion.drift.hypotheses import FilterConfig
 from weldcal.calibration.motion.drift.residuals import CLOCK, FrameNoise, Rows, measured_noise, rows_of

@@ -26,7 +26,7 @@ class Frustum:
 
     Attributes:
         normals: (6, 3) outwards: base, top, then the four sides around the top; distances_m: (6,).
-        corners_top, corners_base: (4, 3) m, each between two sides; hips_m: (4,) lengths of the slanted edges.
+        hips_m: (4,) lengths of the slanted edges.
         dihedrals_rad: (4,) between each side and the top, as the slope of the side; labels: (n,) plane of each point,
             -1 none.
         rms_m: of the points off their planes.
@@ -34,8 +34,6 @@ class Frustum:
 
     normals: Floats
     distances_m: Floats
-    corners_top: Floats
-    corners_base: Floats
     hips_m: Floats
     dihedrals_rad: Floats
     labels: NDArray[np.intp]
@@ -190,16 +188,13 @@ def _measured(p: Floats, labels: NDArray[np.intp], planes: Floats) -> Frustum:
             if np.linalg.cond(A) > 1e3:
                 raise FeatureNotFound("Two sides of the frustum came out parallel: scan all four sides.")
             corners.append(np.asarray(np.linalg.solve(A, d[[a, b, face]]), float))
-    corners_top, corners_base = np.array(top), np.array(base)
     slopes = np.arccos(np.clip(n[2:] @ n[1], -1.0, 1.0))
     used = labels >= 0
     off = np.einsum("ni,ni->n", p[used], n[labels[used]]) - d[labels[used]]
     return Frustum(
         normals=n,
         distances_m=d,
-        corners_top=corners_top,
-        corners_base=corners_base,
-        hips_m=np.linalg.norm(corners_top - corners_base, axis=1),
+        hips_m=np.linalg.norm(np.array(top) - np.array(base), axis=1),
         dihedrals_rad=np.asarray(slopes),
         labels=labels,
         rms_m=float(np.sqrt(np.median(off**2) / 0.455)),

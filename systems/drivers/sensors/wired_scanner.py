@@ -50,11 +50,7 @@ class WiredScanner(ScannerConfig):
 
     def scanner(self) -> ScannerPreset:
         """Return the preset with the configured resolution and field of view."""
-        preset = get_scanner(self.preset, width=self.width, height=self.height)
-        if self.field_of_view_deg is None:
-            return preset
-        fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
-        return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
+        return get_scanner(self.preset, self.width, self.height, self.field_of_view_deg)
 
     def stream_delay_s(self) -> float | None:
         """Return the latency, where the scanner runs freely."""

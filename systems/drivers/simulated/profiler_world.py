@@ -42,7 +42,6 @@ class ProfilerFixture(Message):
     X_BE: RigidTransform
     job: ProfilerJob
     meshes: tuple[tuple[TriMesh, float], ...]
-    X_FS_drawn: RigidTransform
     time_step_s: float = 0.004  # of the plant: nothing in it is more compliant than the arm's servos
 
 

@@ -71,11 +71,7 @@ class RenderedScanner(ScannerConfig):
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the configured resolution and field of view; the pixels' aspect ratio is unchanged."""
-        preset = get_scanner(self.preset, width=self.width, height=self.height)
-        if self.field_of_view_deg is None:
-            return preset
-        fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
-        return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
+        return get_scanner(self.preset, self.width, self.height, self.field_of_view_deg)
 
     def device(self, rng: np.random.Generator) -> ScannerPreset:
         """Return the scanner with the errors of one device; ``rng`` draws its warp."""
@@ -225,15 +221,11 @@ def mount_scanner(config: RenderedScanner, build: StationBuild) -> MountedScanne
     )
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
     preset = config.device(build.rng)
-    k = drake_intrinsics(preset)
     carrier = _carrier(world, config.mounted_on)
     _show_housing(world, X_BC, carrier)
     view = world.scanner_view
     core = RenderCameraCore(
-        view.renderer,
-        CameraInfo(k.width, k.height, k.focal_x, k.focal_y, k.center_x, k.center_y),
-        ClippingRange(0.05, 5.0),
-        RigidTransform(),
+        view.renderer, CameraInfo(*drake_intrinsics(preset)), ClippingRange(0.05, 5.0), RigidTransform()
     )
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     colour = ColorRenderCamera(core, False)

@@ -16,13 +16,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import (
-    JointActuatorIndex,
-    ModelInstanceIndex,
-    PdControllerGains,
-    PrismaticJoint,
-    UniformGravityFieldElement,
-)
+from pydrake.multibody.tree import JointActuatorIndex, ModelInstanceIndex, PdControllerGains, UniformGravityFieldElement
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
@@ -70,7 +64,6 @@ class SimulatedWorld(Message):
     scene_graph: SceneGraph
     arm: ModelInstanceIndex
     tool: ModelInstanceIndex | None
-    tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
     touch_pair: frozenset[GeometryId] | None = None  # whose contact counts as a touch
@@ -154,7 +147,7 @@ def build_world(
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     add_flange(plant, instance, flange)
-    tool_instance, tip_joints = (None, ()) if tool is None else add_tool(plant, instance, tool, tool.tip_radius_m / 2)
+    tool_instance = None if tool is None else add_tool(plant, instance, tool, tool.tip_radius_m / 2)
     second_arm = None if second is None else add_second_arm(plant, second, *servo_gains(second.arm))
     if second_arm is not None:
         add_flange(plant, second_arm, flange)
@@ -206,7 +199,6 @@ def build_world(
         scene_graph=scene_graph,
         arm=instance,
         tool=tool_instance,
-        tip_joints=tip_joints,
         scanner_view=scanner_view,
         second=second_arm,
         touch_pair=touch_pair,

@@ -207,4 +207,4 @@ def draw_fixture(
     ]
     if workpiece is not None and X_BP is not None:
         meshes.append((workpiece.mesh.transformed(X_BP), 0.0))
-    return ProfilerFixture(truth, X_BE, job, tuple(meshes), X_FS_drawn)
+    return ProfilerFixture(truth, X_BE, job, tuple(meshes))

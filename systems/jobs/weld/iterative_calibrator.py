@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, State
 
 from weldcal.calibration.calibrate import PLAIN, Refined, Steps, calibrate
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.eye_on_base.estimate import sigma_at
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
@@ -228,7 +228,7 @@ def digest(
     estimate = found.estimate
     if found.warnings:
         estimate = dc.replace(estimate, warnings=(*found.warnings, *estimate.warnings))
-    predicted = expected_error(estimate, config.p_BWork)
+    predicted = sigma_at(estimate, config.p_BWork)
     figure = status.algorithm_1.cost if status.algorithm_1 is not None else np.nan
     held_out = float(np.median(estimate.held_out.position_m))
     done = len(observations) >= config.minimum_scans and predicted <= config.required_error_m
@@ -244,12 +244,7 @@ def digest(
         return status
     status = refined_status(status, config.refine, arm, config.correct_scanner)
     assert status.estimate is not None
-    return dc.replace(status, predicted_error_m=expected_error(status.estimate, config.p_BWork))
-
-
-def expected_error(estimate: CalibrationEstimate, p_BWork: Array) -> float:
-    """Expected error (m, rms) in the base of a point seen at the work point, by the estimate's covariance."""
-    return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
+    return dc.replace(status, predicted_error_m=sigma_at(status.estimate, config.p_BWork))
 
 
 def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransform) -> VerificationResult:

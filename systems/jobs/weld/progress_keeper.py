@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.models.result_files import write_apart
+from weldcal.models.files import write_apart
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import seam_tool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport

@@ -31,7 +31,7 @@ from weldcal.calibration.data.results import (
 )
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
-from weldcal.models.result_files import write_atomic
+from weldcal.models.files import write_atomic
 from weldcal.tools.cli.app import app
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

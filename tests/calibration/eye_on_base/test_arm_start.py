@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.calibration.eye_on_base.arm_cells import START_M, ArmCell, arm_cell, write_cell
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses, TooFewPoses
 from weldcal.calibration.eye_on_base.arm_start import (
@@ -25,7 +26,6 @@ from weldcal.calibration.eye_on_base.arm_start import (
 from weldcal.models.arms.chain import chain_forward, known_chains, load_chain
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.worlds.arm_cells import START_M, ArmCell, arm_cell, write_cell
 
 FAR = 13  # a Franka at 1.4 m that shows its flange in three of eight scans; none is found without help
 

@@ -7,8 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import CoplanarPoses, InconsistentPoses, RepeatedPoses, TooFewPoses
-from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.eye_on_base.validation import sampling_advice
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.models.errors import InputError

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.geometry.circle import fit_circle, fuse, refine_circles
+from weldcal.calibration.geometry.primitives import fit_circle, fuse, refine_circles
 
 
 def arc(rng: np.random.Generator, n: int, noise: float, turn: float = 2.0 * np.pi) -> np.ndarray:

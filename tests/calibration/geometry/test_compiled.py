@@ -15,8 +15,7 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import find_holes
 from weldcal.calibration.flange.track import borders, near_edge, ring_points
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.geometry.circle import circle_steps
-from weldcal.calibration.geometry.plane import plane_steps
+from weldcal.calibration.geometry.primitives import circle_steps, plane_steps
 from weldcal.calibration.geometry.robust import middle, solved
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner

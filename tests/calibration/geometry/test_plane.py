@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from weldcal.calibration.geometry.plane import fit_plane, shared_noise
+from weldcal.calibration.geometry.primitives import fit_plane, shared_noise
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.2])

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_clock import ARRIVAL, ScannerClock
+from weldcal.calibration.data.scanner_correction import ARRIVAL, ScannerClock
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.motion.drift.watch import watch
 from weldcal.calibration.motion.expected import recorded_stream

@@ -11,8 +11,8 @@ from tests.calibration.eye_on_base.test_solve import make_observations
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.stated_error import ErrorBudget, error_budget
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.budget import ErrorBudget, error_budget
 from weldcal.models.arrays import Array
 
 SIGMA = 2e-4

@@ -20,7 +20,7 @@ from weldcal.calibration.tool.wire import WireTouch, find_wire
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.commands.cell.tool import MEASURED_TOOL, MeasureReport
 from weldcal.tools.commands.doctor import examine
-from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import write_json
 
 TOOLS = 6
 UP = np.array([0.0, 0.0, 1.0])

@@ -82,7 +82,6 @@ def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
         scene_graph=scene,
         arm=still,
         tool=None,
-        tip_joints=(),
         scanner_view=PictureScene(scene, SCANNER_RENDERER, {}, still),
         second=None,
     )

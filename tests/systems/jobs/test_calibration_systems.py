@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station, the_arm
+from weldcal.calibration.eye_on_base.estimate import sigma_at
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arms.inverse import nearest_solution
@@ -24,7 +25,6 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     IterativeCalibrator,
     PoseRequest,
     digest,
-    expected_error,
     verify_at,
 )
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
@@ -178,9 +178,9 @@ def test_the_expected_error_falls_with_more_scans_and_counts_at_the_work_point()
     assert errors[-1] < errors[0]
     status = digested(8, error_m=0.5e-3)
     assert status.estimate is not None
-    near = expected_error(status.estimate, np.array([0.65, 0.0, 0.33]))
-    far = expected_error(status.estimate, np.array([0.65, 0.0, -1.0]))
-    assert status.predicted_error_m == pytest.approx(expected_error(status.estimate, CONFIG.p_BWork))
+    near = sigma_at(status.estimate, np.array([0.65, 0.0, 0.33]))
+    far = sigma_at(status.estimate, np.array([0.65, 0.0, -1.0]))
+    assert status.predicted_error_m == pytest.approx(sigma_at(status.estimate, CONFIG.p_BWork))
     assert near < status.predicted_error_m < far
 
 

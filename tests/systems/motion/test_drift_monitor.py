@@ -8,7 +8,7 @@ import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.scanner_clock import ARRIVAL, DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_correction import ARRIVAL, DEVICE, ScannerClock
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array

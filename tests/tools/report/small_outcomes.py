@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
-from weldcal.calibration.data.scanner_clock import ScannerClock
+from weldcal.calibration.data.scanner_correction import ScannerClock
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import Convergence
 from weldcal.calibration.hand_eye.mountings import get_mounting

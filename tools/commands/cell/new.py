@@ -18,8 +18,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.files import write_atomic
 from weldcal.models.mesh import TriMesh, extrude
-from weldcal.models.result_files import write_atomic
 from weldcal.models.scanners import cast
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file

@@ -24,8 +24,7 @@ from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.commands.cell.new import OwnPart, planned
 from weldcal.tools.commands.cell.screen import Seam, outside_hint, ranked, unit_hint
-from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.render import fixed, render, write_atomic
+from weldcal.tools.report.render import csv_text, fixed, render, write_atomic
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}

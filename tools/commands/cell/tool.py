@@ -32,8 +32,7 @@ from weldcal.systems.scenario.schema import Scenario, WeldingConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.touch import use_kinematics
-from weldcal.tools.report.files import write_json
-from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.render import render, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 

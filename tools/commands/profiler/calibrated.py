@@ -38,10 +38,9 @@ from weldcal.tools.commands.profiler.result import (
     outcome_of,
     with_warnings,
 )
-from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import csv_text, write_atomic, write_json
 
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
 _STREAM, _TIMES = "stream.csv", "times.csv"

@@ -17,7 +17,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioArgument, command, option
 from weldcal.tools.commands.run import JobRun, named_once, run_job, run_options
-from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.profiler_live import (
     WITHIN_MM,
     LiveOutcome,
@@ -26,7 +25,7 @@ from weldcal.tools.report.profiler_live import (
     live_report,
     seeds_report,
 )
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.report.run import RunOptions
 
 PROFILER_SCENARIO = "profiler_seam"

@@ -20,9 +20,8 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioOption, command
 from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, VisitFiles, calibrate_tablet
-from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.report.run import RunOptions, run_document
 from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
 

@@ -25,10 +25,9 @@ from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, render, statistics, write_atomic
+from weldcal.tools.report.render import fixed, mappings_csv, render, statistics, write_atomic
 from weldcal.tools.report.tablet import Page, visits_screen
 
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"

@@ -1,6 +1,5 @@
 """Simulated calibrations without rendering: errors of arms and scanners, and shares of 95 % regions with the truth."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated
@@ -25,7 +24,6 @@ from weldcal.tools.report.pictures import subplots, svg
 from weldcal.tools.report.render import fixed, statistics, write_atomic
 from weldcal.tools.studies.harness import Figures, Results, Row, Study
 from weldcal.tools.worlds import wrong_models
-from weldcal.tools.worlds.arm_cells import calibrate_cell
 from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
 from weldcal.tools.worlds.wrong_models import (
     Found,
@@ -384,34 +382,3 @@ def imperfect(
     folder = IMPERFECT.folder(call)
     found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
     return IMPERFECT.found(_imperfect(found), folder)
-
-
-def _start_figures(results: Results) -> Figures:
-    of = results.values()
-    counts: Figures = {k: Counter(str(r.get(k, "failed")) for r in of) for k in ("start", "calibration", "alone")}
-    return {"cells": len(of), **counts, "start_mm": statistics(r.get("start_mm", np.nan) for r in of)}
-
-
-def _start_rows(f: Figures) -> Iterable[Row]:
-    yield from ((k, ", ".join(f"{n} {v}" for v, n in sorted(f[k].items()))) for k in ("start", "calibration", "alone"))
-    yield "error of all starts at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
-
-
-START = Study(
-    name="flange-start",
-    what=(
-        "Ray-cast cells of seven arms with a small, far or hidden flange, calibrated without a guess; the start is from"
-        " three scans."
-    ),
-    case=calibrate_cell,
-    figures=_start_figures,
-    header=("", "found"),
-    rows=_start_rows,
-)
-
-
-@command("benchmark flange-start", short_help="Calibrate cells whose flange is small, far or hidden.", hidden=True)
-def start(call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 200) -> Outcome:
-    """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in
-    three scans."""
-    return START.outcome(call, {f"cell {call.seed + k}": {"seed": call.seed + k} for k in range(cells)})

@@ -1,19 +1,13 @@
-"""Study ray-cast frames: flanges found and imagined, half-hidden ones, and the turn of filled hole patterns."""
+"""Study ray-cast frames: flanges found and imagined, and half-hidden ones."""
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from itertools import combinations
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
-from weldcal.calibration.flange.holes import HolePattern, find_holes
-from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import fixed, statistics
@@ -24,7 +18,6 @@ WidthOption = Annotated[int, option("--width", "PX", "Width of the PhoXi M image
 FlangeName = Annotated[str, option("--flange", "NAME", "Flange standard.")]
 FLANGE = "iso9409-1-50-4-m6"
 SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
-_WRONG_RAD = float(np.radians(10.0))  # half of the least symmetry that a pattern has is more
 
 
 def fit_one(width: int, flange: str, rng: Sequence[int], kind: str, share: float = 0.5) -> dict[str, Any]:
@@ -153,109 +146,3 @@ def hidden(
     of the stated uncertainty."""
     get_flange(flange)
     return HIDDEN.outcome(call, hidden_cases(count, share, call.seed, width, flange))
-
-
-def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], name: str) -> Mapping[str, object]:
-    """Find the hole pattern's turn with these openings filled: "none", "open", "right" or "wrong" (over 10 deg)."""
-    scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
-    frame = flange_frame(scanner, _with_filled(standard, filled), np.random.default_rng(list(rng)))
-    assert frame.X_CR is not None
-    try:
-        pattern = find_holes(frame.points_C, fit_flange(frame.points_C, standard), standard)
-    except FlangeNotFound:
-        pattern = None
-    if pattern is None or not pattern.turn_known:
-        return {"name": name, "turn": "none" if pattern is None else "open"}
-    error = _turn_error(pattern, frame.X_CR)
-    return {
-        "name": name,
-        "turn": "right" if abs(error) < _WRONG_RAD else "wrong",
-        "normalised": float(np.square(error / pattern.turn_sigma)),
-    }
-
-
-def _with_filled(standard: FlangeStandard, filled: Sequence[int]) -> FlangeStandard:
-    """Return the flange without these of its openings (threads in order, then the dowel hole)."""
-    threads = tuple(a for k, a in enumerate(standard.hole_angles_rad) if k not in filled)
-    pin = 0.0 if standard.n_holes in filled else standard.pin_m
-    return replace(standard, n_holes=len(threads), hole_angles_rad=threads, pin_m=pin)
-
-
-def _turn_error(pattern: HolePattern, X_CR: RigidTransform) -> float:
-    """Error (rad) of the pattern's rotation about the flange axis."""
-    R = (X_CR.rotation().inverse() @ pattern.X_CR.rotation()).matrix()
-    return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
-
-
-def _fillings(standard: FlangeStandard) -> Iterator[tuple[str, list[tuple[int, ...]]]]:
-    """Names and the openings that each fills, by turns."""
-    n = standard.n_holes
-    names = [*(f"thread {k + 1}" for k in range(n)), *(["dowel hole"] if standard.pin_m > 0.0 else [])]
-    yield "nothing", [()]
-    for k, name in enumerate(names):
-        yield name, [(k,)]
-    yield "two", list(combinations(range(len(names)), 2))
-
-
-def hole_cases(scans: int, seed: int, width: int, flange: str = FLANGE) -> Cases:
-    """``scans`` scans of the open pattern, of each opening filled alone and of all pairs of them.
-
-    Raises:
-        InputError: a flange without holes.
-    """
-    standard = get_flange(flange)
-    if standard.n_holes == 0:
-        raise InputError(f"The flange '{standard.designation}' has no holes to fill: give one of ISO 9409-1.")
-    of = {"width": width, "flange": flange}
-    return {
-        f"{name} filled, scan {k}": {**of, "filled": choices[k % len(choices)], "rng": [seed, c, k], "name": name}
-        for c, (name, choices) in enumerate(_fillings(standard))
-        for k in range(scans)
-    }
-
-
-def _hole_figures(results: Results) -> Figures:
-    rows: list[dict[str, Any]] = []
-    for name in dict.fromkeys(r["name"] for r in results.values()):
-        found = [r for r in results.values() if r["name"] == name]
-        count = Counter(r["turn"] for r in found)
-        square = [r["normalised"] for r in found if r["turn"] == "right"]
-        rows.append(
-            {
-                "filled": name,
-                "scans": len(found),
-                "no_pattern": count["none"],
-                "left_open": count["open"],
-                "right": count["right"],
-                "wrong": count["wrong"],
-                "mean_normalised": statistics(square, "mean")["mean"],
-            }
-        )
-    return {"rows": rows}
-
-
-def _hole_rows(f: Figures) -> Iterable[Row]:
-    for r in f["rows"]:
-        yield r["filled"], *(str(r[key]) for key in ("scans", "right", "wrong", "left_open", "no_pattern"))
-
-
-HOLES = Study(
-    name="flange-holes",
-    what="The rotation about the flange axis from hole patterns with filled holes.",
-    case=turn_of,
-    figures=_hole_figures,
-    header=("filled", "scans", "right", "wrong", "left open", "without a pattern"),
-    rows=_hole_rows,
-    numbers=5,
-)
-
-
-@command("benchmark flange-holes", short_help="Fill holes of the flange and count wrong rotations.", hidden=True)
-def holes(
-    call: Call,
-    scans: Annotated[int, option("--scans", "N", "Number of scans for each set of filled holes.", min=1)] = 200,
-    width: WidthOption = 1032,
-    flange: FlangeName = FLANGE,
-) -> Outcome:
-    """Fill holes of the flange and count the rotations about its axis that are stated, left open and wrong."""
-    return HOLES.outcome(call, hole_cases(scans, call.seed, width, flange))

@@ -16,8 +16,8 @@ from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.coverage import arm, honesty, imperfect, stated
 from weldcal.tools.studies.flange.live import live
-from weldcal.tools.studies.flange.recorded import few, halves, parts
-from weldcal.tools.studies.flange.scans import frames, hidden, holes
+from weldcal.tools.studies.flange.recorded import few
+from weldcal.tools.studies.flange.scans import frames, hidden
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.worlds.flange_frames import FlangeScan, facing, flange_frame
 
@@ -166,16 +166,13 @@ def speed(
     speed=speed,
     frames=frames,
     hidden=hidden,
-    parts=parts,
     honesty=honesty,
     stated=stated,
     live=live,
     few=few,
-    holes=holes,
     imperfect=imperfect,
-    halves=halves,
     arm=arm,
 )
 def flange(call: Call) -> None:
-    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty
-    (parts, honesty, stated, imperfect, halves) and accuracy (live, few, arm)."""
+    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden), uncertainty
+    (honesty, stated, imperfect) and accuracy (live, few, arm)."""

@@ -20,7 +20,6 @@ from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
 from weldcal.tools.studies.hand_eye.cells import hand_eye_pictures as pictures
-from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions as conventions
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.worlds.hand_eye import fuzz
 
@@ -218,11 +217,8 @@ def hand_eye_sets(
 
 
 @command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)
-@one_of(
-    "sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, conventions=conventions, pictures=pictures
-)
+@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, pictures=pictures)
 def hand_eye(call: Call) -> None:
     """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in
-    simulation, calibrate every mounting live (mountings), read pose lists in random conventions (conventions), and
-    calibrate from rendered pictures (pictures).
+    simulation, calibrate every mounting live (mountings), and calibrate from rendered pictures (pictures).
     """

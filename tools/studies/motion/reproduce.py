@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
 from weldcal.calibration.flange.fit import FlangeFit, face_cloud
-from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, fit_rigid, rotation_vector
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
@@ -312,7 +312,7 @@ class _Verifier:
         # the unsynchronised error, some 30 mm, must be within reach; a search farther than needed takes most of the
         # time
         off = float(np.linalg.norm(X_BC @ self._fits[id].center_C - X_BF[:3, 3]))
-        verification = replace(self.model(id), X_BR=_rigid(X_BF), max_distance_m=max(_REACH_M, 2.0 * off))
+        verification = replace(self.model(id), X_BR=as_transform(X_BF), max_distance_m=max(_REACH_M, 2.0 * off))
         found = icp_error(X_BC, verification)
         return np.asarray(found.value * _TO_MM), found.X_CpC
 
@@ -426,10 +426,6 @@ def _matching(errors: Array, kept: Array, wanted: Array) -> Array:
 def _spread(index: NDArray[np.intp], n: int) -> NDArray[np.intp]:
     """At most ``n`` of the indices, evenly spread."""
     return np.asarray(index[np.unique(np.linspace(0, len(index) - 1, min(n, len(index))).astype(int))])
-
-
-def _rigid(X: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
 def _rms(values: Array) -> float:

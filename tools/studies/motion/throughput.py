@@ -44,7 +44,7 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.commands.monitor_body import track_link
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import write_json
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, Target, all_met, print_targets, whole
 from weldcal.tools.studies.motion.drift import benchmark_drift
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset

@@ -14,8 +14,7 @@ from weldcal.models.scanners import SCANNERS, get_scanner
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.files import mappings_csv
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.worlds.parts.scans import (
     PLANNED,
     REFUSED,

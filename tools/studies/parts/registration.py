@@ -19,8 +19,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.files import mappings_csv
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.worlds.parts.scans import REFUSALS, PartScene, Subject, scan_scene, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.model import PartModel

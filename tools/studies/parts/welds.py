@@ -12,8 +12,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.commands.weld import run_scenario
-from weldcal.tools.report.files import mappings_csv
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.parts.planning import planning
 from weldcal.tools.studies.parts.registration import registration

@@ -11,8 +11,7 @@ from weldcal.tools.cli.options import FARM, Call, command, option
 from weldcal.tools.cli.options import Outcome as Printed
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.emulators.ur.process import emulator_process
-from weldcal.tools.report.files import csv_text, write_json
-from weldcal.tools.report.render import statistics, write_atomic
+from weldcal.tools.report.render import csv_text, statistics, write_atomic, write_json
 from weldcal.tools.studies.robot.stream import TRANSPORT, jobs, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench

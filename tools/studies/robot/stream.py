@@ -32,8 +32,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.commands.run import robot_at
 from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
-from weldcal.tools.report.files import csv_text, write_json
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import csv_text, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.robot.fault_run import LOADED
 from weldcal.tools.worlds.robot.timing import STEP_JOINT, STEP_RAD_S, HostLateness, Tap, watched_host

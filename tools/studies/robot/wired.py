@@ -18,8 +18,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.report.files import mappings_csv, write_json
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import mappings_csv, write_atomic, write_json
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, markdown_table
 from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
 

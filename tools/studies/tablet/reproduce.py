@@ -36,9 +36,8 @@ from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
 from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
-from weldcal.tools.report.render import fixed
+from weldcal.tools.report.render import fixed, write_json
 from weldcal.tools.studies.harness import Figures, Row, Study, Table, Target, all_met
 from weldcal.tools.worlds.tablet import (
     STAGE_1,

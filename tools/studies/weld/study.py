@@ -11,9 +11,8 @@ import numpy as np
 
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths
-from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.report.render import csv_text, fixed, write_atomic
 from weldcal.tools.studies.harness import RUNS, Figures, Measured, Study, Target, verdict
 from weldcal.tools.studies.weld.rows import (
     CHORDS,

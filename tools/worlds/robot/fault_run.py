@@ -239,7 +239,6 @@ class FaultSequence:
     thrown: Counter[str] = field(default_factory=Counter)
     reported: Counter[str] = field(default_factory=Counter)
     starts: int = 0
-    starts_refused: int = 0
     unasked_stops: int = 0  # stops before any fault was thrown in: the load of this computer
     moves_without_a_command: int = 0
     moves_after_a_fault: int = 0
@@ -294,7 +293,6 @@ def _start(bench: Bench, rng: np.random.Generator, done: FaultSequence) -> bool:
         done.starts += 1
         bench.start(look=bool(rng.random() < 0.7))
     except WeldcalError:
-        done.starts_refused += 1
         bench.end()
         bench.emulator.do("recover")
         return False

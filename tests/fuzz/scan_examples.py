@@ -11,8 +11,8 @@ import numpy as np
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
+from tests.fuzz.file_examples import Files, Rng, hand_eye_lists, points
 from weldcal.models.arrays import Array
-from weldcal.tools.worlds.file_examples import Files, Rng, hand_eye_lists, points
 
 _W, _H = 12, 10
 _XYZ = "property float x\nproperty float y\nproperty float z\n"

@@ -3,8 +3,6 @@
 An arm of drawn housings, a second arm, a table and clutter, by rays.
 """
 
-import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,17 +11,14 @@ import numpy as np
 import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.eye_on_base.arm_start import arm_shape, find_arm
 from weldcal.models.arms.chain import Chain, chain_inverse, load_chain
 from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
 from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.profilers import make_scene
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.render import csv_text
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "aubo_i5", "franka_fr3")
 REACH_M = {"ur3e": 0.5, "ur5e": 0.85, "ur10e": 1.3, "ur16e": 0.9, "ur20": 1.75, "aubo_i5": 0.88, "franka_fr3": 0.85}
@@ -274,36 +269,3 @@ def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
     (folder / "clouds").mkdir(exist_ok=True)
     for k, cloud in enumerate(cell.clouds):
         np.savez(folder / "clouds" / f"p{k:02d}.npz", points=cloud.astype(np.float32))
-
-
-def calibrate_cell(seed: int) -> Mapping[str, object]:
-    """Return the cell of a seed calibrated without a guess, and the start from three of its scans.
-
-    "right", "wrong" or "refused" each; "alone" is what it is without the arm.
-    """
-    cell = arm_cell(seed)
-    work = np.mean([X.translation() for X in cell.X_BF], axis=0)
-
-    def error(X_BC: RigidTransform) -> float:
-        return float(np.linalg.norm(X_BC @ (cell.X_BC.inverse() @ work) - work))
-
-    found: dict[str, object] = {"arm": cell.arm, "start": "refused", "calibration": "refused", "mm": None}
-    arm = load_chain(cell.arm)
-    start = find_arm(cell.clouds[:START_SCANS], [arm_shape(arm, q) for q in cell.q[:START_SCANS]])
-    if start is not None:
-        off = error(start.X_BC)
-        found |= {"start_mm": 1e3 * off, "explained": start.explained, "seen_through": start.seen_through}
-        found["lead"] = start.score - start.next_best
-        if start.accepted:
-            found["start"] = "right" if off < START_M else "wrong"
-    with tempfile.TemporaryDirectory() as folder:
-        write_cell(cell, Path(folder) / "cell")
-        try:
-            report = calibrate_dataset(Path(folder) / "cell", Path(folder) / "out")
-        except InputError as reason:
-            return found | {"alone": "refused", "reason": str(reason)[:300]}
-    off = error(report.result.X_BC)
-    by_arm = any("visible arm agrees" in text for text in report.result.warnings)
-    verdict = "right" if off < RIGHT_M else "wrong"
-    found |= {"mm": 1e3 * off, "scans": len(report.observations)}
-    return found | {"calibration": verdict, "alone": "refused" if by_arm else verdict}

@@ -1,36 +1,25 @@
-"""`weldcal benchmark fuzz-files`: damaged files for every reader, read in a child process."""
+"""Give every file reader damaged files, read in a child process: `python -m tests.fuzz.run --cases 1000`.
 
+Files of every format are damaged by its own grammar: each reader must accept or refuse them by a sentence, in 10 s and
+1 GB.
+"""
+
+import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Any
 
+from tests.fuzz.damaged_files import GOOD, READERS, Child, Reader, damaged, lay_out
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.damaged_files import GOOD, READERS, Child, Reader, damaged, lay_out
 
 _KEPT = 20  # offending files of each reader and verdict
-
-
-@command("benchmark fuzz-files", short_help="Give every file reader damaged files.")
-def benchmark_fuzz_files(
-    call: Call,
-    cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
-    readers: Annotated[
-        list[str] | None, option("--readers", "NAME", "Only this reader; repeat for more.", show_default="all")
-    ] = None,
-) -> Outcome:
-    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s
-    and 1 GB."""
-    wanted = chosen(readers or ())
-    result = fuzz_files(wanted, cases, call.seed, call.folder("benchmark", "fuzz-files"), call.progress)
-    rows = {name: ", ".join(f"{n} {said}" for said, n in count.most_common()) for name, count in result.counts.items()}
-    return Outcome(result.summary(), values={}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -119,3 +108,21 @@ def _keep(reader: Reader, seed: int, case: int, out: Path) -> str:
     folder = out / f"{reader.name}-{case}"
     lay_out(folder, files, reader.target, place)
     return str(folder)
+
+
+def main() -> bool:
+    """Run the cases of the command line, print the verdicts of each reader, and return whether one must not be."""
+    words = argparse.ArgumentParser(description=__doc__)
+    words.add_argument("--cases", type=int, default=1000, help="damaged files for each reader")
+    words.add_argument("--readers", action="append", default=[], metavar="NAME", help="only this; repeat for more")
+    words.add_argument("--seed", type=int, default=0)
+    words.add_argument("--out", type=Path, default=Path("build/fuzz"), help="folder of the findings")
+    asked = words.parse_args()
+    result = fuzz_files(chosen(asked.readers), asked.cases, asked.seed, asked.out)
+    for name, count in result.counts.items():
+        print(f"{name}: {', '.join(f'{n} {said}' for said, n in count.most_common())}")
+    return bool(result.findings)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

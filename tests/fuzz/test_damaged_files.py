@@ -9,10 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from weldcal.models.errors import InputError
-from weldcal.tools.studies import fuzz_files as fuzz
-from weldcal.tools.worlds import damaged_files as cases
-from weldcal.tools.worlds.damaged_files import (
+from tests.fuzz import damaged_files as cases
+from tests.fuzz import run as fuzz
+from tests.fuzz.damaged_files import (
     ACCEPTED,
     CRASH,
     GOOD,
@@ -27,6 +26,7 @@ from weldcal.tools.worlds.damaged_files import (
     judge,
     too_much,
 )
+from weldcal.models.errors import InputError
 
 SLOW = ("scenario",)  # a tenth of a second each
 

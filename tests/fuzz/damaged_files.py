@@ -25,6 +25,10 @@ from typing import Any
 import numpy as np
 from pydrake.common.yaml import yaml_dump_typed
 
+from tests.fuzz import file_examples as examples
+from tests.fuzz import scan_examples
+from tests.fuzz.damage import GRAMMARS
+from tests.fuzz.file_examples import Files, Rng
 from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
@@ -38,10 +42,6 @@ from weldcal.models.array_files import read_grey_image
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import file_examples as examples
-from weldcal.tools.worlds import scan_examples
-from weldcal.tools.worlds.damage import GRAMMARS
-from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
 
 ACCEPTED, REFUSED, INTERNAL, WRONG = "accepted", "refused", "internal error", "silently wrong"
@@ -310,7 +310,7 @@ def digest(values: Any) -> str:
 
 
 WATCHDOG_S = 10.0
-WORKER = ("-m", "weldcal.tools.worlds.damaged_files")
+WORKER = ("-m", "tests.fuzz.damaged_files")
 _START_S = 120.0  # to import everything, on a slow computer
 FREE = 1024**3  # bytes above those of the idle process that any file may take
 TIMES = 10  # and as many times the size of the file
@@ -362,7 +362,12 @@ class Child:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+            env={
+                **os.environ,
+                "OMP_NUM_THREADS": "1",
+                "PYTHONUNBUFFERED": "1",
+                "PYTHONPATH": os.pathsep.join(sys.path),
+            },
         )
         return self._process
 
