@@ -408,24 +408,24 @@ def _fit_up_at(
 def _opening(rows: Floats) -> tuple[float, float]:
     """Compute the width m of the gap between level faces, and its sigma.
 
-    It is the widest band along the seam without a point of both (M,3), apart from one stray point. Where it ends
-    between two points of a face is not known: from a line to the nearest point it is half of E[L^2] / E[L], by the
-    distances L across the seam.
+    It is the widest band along the seam without a point of both (M,3), apart from one stray point. Each of its ends
+    lies between two points: by their distances L across the seam, half of E[L^2] / E[L] from the nearest on average.
     """
-    gap, sigma = -math.inf, math.nan
+    widest, gap, sigma = 0.0, math.nan, math.nan
     for slope in BANDS:
         x = np.unique(rows[:, 0] - slope * rows[:, 2])
-        if len(x) < 40 or not x[0] < -MOST_M < MOST_M < x[-1]:
+        if not x[0] < -MOST_M < MOST_M < x[-1]:
             continue
         steps = np.diff(x)
         near = np.abs(x[:-1] + 0.5 * steps) < 2.0 * MOST_M
         k = int(np.argmax(np.where(near, steps, 0.0)))
         mean, two, three = (float(np.mean(np.delete(steps, k) ** n)) for n in (1, 2, 3))
         rest = 0.5 * two / mean
-        width = steps[k] + max((d for d in steps[[k - 1, k + 1]] if d > STRAY * rest), default=0.0)
-        if width - 2.0 * rest > gap:
-            gap, sigma = float(width) - 2.0 * rest, math.sqrt(max(0.0, 2.0 * (three / (3.0 * mean) - rest**2)))
-    return (max(0.0, gap), math.hypot(sigma, EDGE_LOST_M)) if math.isfinite(gap) else (math.nan, math.nan)
+        width = float(steps[k]) + max((d for d in steps[[k - 1, k + 1]] if d > STRAY * rest), default=0.0)
+        if width > widest:
+            spread = max(0.0, three / (3.0 * mean) - rest**2)
+            widest, gap, sigma = width, max(0.0, width - 2.0 * rest), math.hypot(math.sqrt(2.0 * spread), EDGE_LOST_M)
+    return gap, sigma
 
 
 def _strips(x: Floats, s: Floats) -> list[Floats]:
