@@ -372,17 +372,17 @@ def gone_on(
     Raises:
         PartMoved, NoRoomBehindCrater: see Restart.
     """
-    from_m, config = float(whole.project(seam.position(0.0))), planning.config
-    if planning.restart is None or not planning.goes_on():
+    from_m, config, restart = float(whole.project(seam.position(0.0))), planning.config, planning.restart
+    if restart is None or not planning.goes_on():
         return planning.beginning_at(from_m, seam, whole), seam, arc, {"begins_m": from_m}
-    planning.restart.check_unmoved(whole, X_BP, sigma_m)
+    restart.check_unmoved(whole, X_BP, sigma_m)
     run_up_m, window_m = RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
-    cut = planning.restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
+    cut = restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
     again = {"begins_m": cut.start_m, "question": cut.question(planning.number)}
     planning = planning.beginning_at(cut.start_m, cut.line, whole)
     if cut.down_m is None:
         return planning, seam, arc, again
-    again["felt_before"] = planning.restart.felt
+    again["felt_before"] = restart.felt
     return dc.replace(planning, config=leaning(planning.config, 0.0, cut.down_m)), cut.line, cut.down_m, again
 
 
