@@ -101,7 +101,7 @@ def judged(joint: str, name: str) -> tuple[float, float, float]:
 
 LARGEST = {
     ("butt", "gap"): (0.15, 0.5), ("butt", "misalignment"): (0.1, 0.25), ("butt", "angle"): (0.6, 1.5),
-    ("fillet", "gap"): (0.9, 2.2), ("fillet", "angle"): (0.6, 1.5), ("lap", "gap"): (0.06, 0.15),
+    ("fillet", "gap"): (0.4, 1.0), ("fillet", "angle"): (0.6, 1.5), ("lap", "gap"): (0.06, 0.15),
 }  # fmt: skip
 """Root mean square and largest error, with points 0.9 mm apart and noise of 0.1 mm."""
 
