@@ -105,15 +105,6 @@ class SeamPlanning(Welder):
         tool = self.tools[number] if number < len(self.tools) else self.tool
         return dc.replace(self, workpiece=numbered(self.workpiece, number), number=number, config=config, tool=tool)
 
-    def beginning_at(self, begins_m: float, line: SeamCurve, whole: SeamCurve) -> Self:
-        """Return what a line is planned from that begins there on the whole seam: its angles are those of its places."""
-        order = self.config.angles
-        if order is None:
-            return self
-        order = order.between(begins_m / whole.length, min((begins_m + line.length) / whole.length, 1.0))
-        torch = dc.replace(self.config.torch, work_angle_rad=0.5 * sum(order.work_rad))
-        return dc.replace(self, config=dc.replace(self.config, angles=order, torch=torch))
-
     def without_tacks(self, points_B: Array, seam: SeamCurve) -> Array:
         """The points (n, 3) m of a scan that are not of the ordered tacks; the seam is the tip's line."""
         for tack in self.config.tacks:
@@ -357,6 +348,16 @@ def stitch_piece(
     return dc.replace(planning, config=config), line, record, planning.piece + 1 < len(pieces)
 
 
+def _placed(planning: SeamPlanning, begins_m: float, line: SeamCurve, whole: SeamCurve) -> SeamPlanning:
+    """The planning of a line that begins at a place of the whole seam: its angles are those of its places."""
+    config = planning.config
+    if config.angles is None:
+        return planning
+    angles = config.angles.between(begins_m / whole.length, min((begins_m + line.length) / whole.length, 1.0))
+    torch = dc.replace(config.torch, work_angle_rad=0.5 * sum(angles.work_rad))
+    return dc.replace(planning, config=dc.replace(config, angles=angles, torch=torch))
+
+
 def gone_on(
     planning: SeamPlanning,
     seam: SeamCurve,
@@ -374,12 +375,12 @@ def gone_on(
     """
     from_m, config, restart = float(whole.project(seam.position(0.0))), planning.config, planning.restart
     if restart is None or not planning.goes_on():
-        return planning.beginning_at(from_m, seam, whole), seam, arc, {"begins_m": from_m}
+        return _placed(planning, from_m, seam, whole), seam, arc, {"begins_m": from_m}
     restart.check_unmoved(whole, X_BP, sigma_m)
     run_up_m, window_m = RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
     cut = restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
     again = {"begins_m": cut.start_m, "question": cut.question(planning.number)}
-    planning = planning.beginning_at(cut.start_m, cut.line, whole)
+    planning = _placed(planning, cut.start_m, cut.line, whole)
     if cut.down_m is None:
         return planning, seam, arc, again
     again["felt_before"] = restart.felt
