@@ -5,7 +5,7 @@ The defaults are those of docs/weld_law.md.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 
@@ -261,6 +261,12 @@ class TorchAngles:
     stiffness_ratio: float = 0.5
     seat: Callable[[Press], Seated] | None = None
     stick_out_m: float = math.nan
+
+    def between(self, first: float, last: float) -> "TorchAngles":
+        """What is ordered on a part of the seam, given by its ends as shares of the whole seam."""
+        ends = (self.work_rad, self.travel_rad, self.rotation_rad)
+        work, travel, rotation = ((a[0] + first * (a[1] - a[0]), a[0] + last * (a[1] - a[0])) if a else a for a in ends)
+        return replace(self, work_rad=work or (0.0, 0.0), travel_rad=travel, rotation_rad=rotation)
 
 
 @dataclass(frozen=True, kw_only=True)

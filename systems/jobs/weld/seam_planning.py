@@ -348,6 +348,16 @@ def stitch_piece(
     return dc.replace(planning, config=config), line, record, planning.piece + 1 < len(pieces)
 
 
+def _placed(planning: SeamPlanning, begins_m: float, line: SeamCurve, whole: SeamCurve) -> SeamPlanning:
+    """The planning of a line that begins at a place of the whole seam: its angles are those of its places."""
+    config = planning.config
+    if config.angles is None:
+        return planning
+    angles = config.angles.between(begins_m / whole.length, min((begins_m + line.length) / whole.length, 1.0))
+    torch = dc.replace(config.torch, work_angle_rad=0.5 * sum(angles.work_rad))
+    return dc.replace(planning, config=dc.replace(config, angles=angles, torch=torch))
+
+
 def gone_on(
     planning: SeamPlanning,
     seam: SeamCurve,
@@ -363,17 +373,18 @@ def gone_on(
     Raises:
         PartMoved, NoRoomBehindCrater: see Restart.
     """
-    from_m, config = float(whole.project(seam.position(0.0))), planning.config
-    if planning.restart is None or not planning.goes_on():
-        return planning, seam, arc, {"begins_m": from_m}
-    planning.restart.check_unmoved(whole, X_BP, sigma_m)
+    from_m, config, restart = float(whole.project(seam.position(0.0))), planning.config, planning.restart
+    if restart is None or not planning.goes_on():
+        return _placed(planning, from_m, seam, whole), seam, arc, {"begins_m": from_m}
+    restart.check_unmoved(whole, X_BP, sigma_m)
     run_up_m, window_m = RUN_UP_S * config.weld_speed_m_s, config.gap.end_window_m
-    cut = planning.restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
+    cut = restart.cut(seam, planning.tool.chord_m, run_up_m, window_m, from_m)
     again = {"begins_m": cut.start_m, "question": cut.question(planning.number)}
+    planning = _placed(planning, cut.start_m, cut.line, whole)
     if cut.down_m is None:
         return planning, seam, arc, again
-    again["felt_before"] = planning.restart.felt
-    return dc.replace(planning, config=leaning(config, 0.0, cut.down_m)), cut.line, cut.down_m, again
+    again["felt_before"] = restart.felt
+    return dc.replace(planning, config=leaning(planning.config, 0.0, cut.down_m)), cut.line, cut.down_m, again
 
 
 def added_variance(

@@ -9,8 +9,8 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.systems.jobs.test_unfelt import planning
-from tests.welding.locate.lying import FLOOR, TABLE, box, looking, pose, put, scan
-from tests.welding.locate.test_fit_up import drawn
+from tests.welding.locate.lying import FLOOR, TABLE, looking, pose, put, scan
+from tests.welding.locate.test_fit_up import drawn, parts
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.arc_schedule import ArcSchedule
 from weldcal.systems.jobs.weld.seam_planning import planned_gap
@@ -36,22 +36,23 @@ LENGTH_M = 0.190  # of the drawn seam
 
 
 def rising_gap(s_m: float) -> float:
-    """The true gap m of the tilted sheet: 0.1 mm at the seam's start to 2.95 mm at its end."""
+    """The true gap m of the turned plate: 0.1 mm at the seam's start to 2.95 mm at its end."""
     return 1e-4 + 2.85e-3 * s_m / LENGTH_M
 
 
-@pytest.fixture(scope="module")
-def measured() -> GapAlong:
-    """A lap whose upper sheet lies tilted along the seam, scanned by a ray caster of its own."""
-    lower = box((-0.11, 0.11), (-0.07, 0.05), (-0.008, 0.0))
-    tilt = pose((0.0, 0.0, rising_gap(0.5 * LENGTH_M)), (0.0, -math.atan(2.85e-3 / LENGTH_M), 0.0))
-    solids = [lower, *put([box((-0.10, 0.10), (-0.05, 0.0), (0.0, 0.006))], tilt)]
+def cast(joint: str, seed: int) -> GapAlong:
+    """A lap whose upper sheet is tilted along the seam, or plates that open along it, scanned by a ray caster of its
+    own."""
+    turn, middle = math.atan(2.85e-3 / LENGTH_M), rising_gap(0.5 * LENGTH_M)
+    first, second = parts(joint, 0.0, 0.0, 0.0)
+    X = pose((0.0, 0.0, middle), (0.0, -turn, 0.0)) if joint == "lap" else pose((0.0, middle, 0.0), (0.0, 0.0, turn))
+    solids = [first, *put([second], X)]
     X = pose((0.6, 0.0, 0.008), (0.0, 0.0, 0.4))
-    eye = X[:3, :3] @ np.array([0.05, 0.4, 0.75]) + X[:3, 3]
-    cloud = scan([*put(solids, X), TABLE, FLOOR], looking(eye, X[:3, 3]), np.random.default_rng(46))
+    eye = X[:3, :3] @ np.array([0.05, 0.4 if joint == "lap" else 0.1, 0.75]) + X[:3, 3]
+    cloud = scan([*put(solids, X), TABLE, FLOOR], looking(eye, X[:3, 3]), np.random.default_rng(seed))
     points = cloud.reshape(-1, 3)
     points, X_BP = points[np.isfinite(points).all(axis=1)], RigidTransform(X)
-    model, seam = drawn("lap")
+    model, seam = drawn(joint)
     near, normals = _about_seam(into(X_BP, points), into(X_BP, eye[None])[0], seam)
     found = measure_fit_up(near, normals, 0.75 / 850.0, model, seam)
     line = SeamCurve.from_points(seam.points_P)
@@ -60,10 +61,19 @@ def measured() -> GapAlong:
     return gap
 
 
-def test_the_schedule_follows_a_gap_of_0_to_3_mm_within_a_table_step(measured: GapAlong) -> None:
+@pytest.fixture(scope="module")
+def measured() -> GapAlong:
+    """Of a lap."""
+    return cast("lap", 46)
+
+
+@pytest.mark.parametrize(("joint", "seed"), [("lap", 46), ("butt", 47)])
+def test_the_schedule_follows_a_gap_of_0_to_3_mm_within_a_table_step(joint: str, seed: int) -> None:
+    gap = cast(joint, seed)
     for s in np.linspace(0.0, LENGTH_M, 96):
-        feed = TABLE_BY_GAP.values(measured.at(s), 10.0).wire_feed_m_min
-        speed = 1e3 * TABLE_BY_GAP.speed_m_s(measured.at(s), 0.0)
+        assert gap.at(s) == pytest.approx(rising_gap(s), abs=0.25e-3)
+        feed = TABLE_BY_GAP.values(gap.at(s), 10.0).wire_feed_m_min
+        speed = 1e3 * TABLE_BY_GAP.speed_m_s(gap.at(s), 0.0)
         k = int(1e3 * rising_gap(s) / 0.5)  # the true gap is between the rows k and k + 1
         around = ROWS[max(k - 1, 0) : k + 3]
         assert min(r[1] for r in around) <= feed <= max(r[1] for r in around), s

@@ -12,16 +12,19 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.systems.jobs.test_unfelt import planning
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool, tool_file
 from weldcal.models.workpieces.seat import JointSection, Press, press_for, seat
+from weldcal.systems.jobs.weld.seam_planning import gone_on
 from weldcal.welding.numerics import Array
 from weldcal.welding.passes.angles import angles_along, leaned, lifted
 from weldcal.welding.passes.felt import WeldPass, pass_config
 from weldcal.welding.record.process import wire_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows
+from weldcal.welding.seam.restart import Restart
 from weldcal.welding.servo.settings import (
     TORCH_ABOVE_ROOT_M,
     DeflectionControl,
@@ -144,6 +147,31 @@ def test_angles_run_linearly_along_the_seam() -> None:
     assert at.deflection.axial_d_m == pytest.approx(float(np.interp(0.15, along.s_tip, along.axial_m)))
     lead = config.weld_speed_m_s / config.torch.k_roll
     assert at.torch.work_angle_rad == pytest.approx(float(np.interp(0.1 + lead, along.s_torch, along.roll_rad)))
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_part_of_a_seam_has_the_angles_of_its_places(restart: bool) -> None:
+    """Between obstacles, and where a broken weld goes on at 80 mm."""
+    _, whole, config = setup(work=(-5.0, 5.0), travel=(-2.0, 1.0))
+    begins, s = 0.08, np.linspace(0.0, whole.length, 400)
+    piece, broken = whole, None
+    if restart:
+        broken = Restart(seam=0, p_BCrater=np.asarray(whole.position(begins)), overlap_m=0.0)
+    else:
+        s = s[(s >= begins) & (s <= 0.18)]
+        piece = SeamCurve.from_points(whole.position(s), up=whole.up(s))
+    order = replace(planning(restart=broken), config=config)
+    plan, line, _, again = gone_on(order, piece, whole, None, math.nan, None)
+    assert again["begins_m"] == pytest.approx(s[0] if not restart else begins, abs=1e-4)
+    along, of_part = angles_along(whole, config), angles_along(line, plan.config)
+    for torch in (0.005, 0.02, 0.035):
+        tip = torch + 0.06
+        found, wanted = of_part.at(plan.config, tip, torch), along.at(config, begins + tip, begins + torch)
+        assert found.torch.work_angle_rad == pytest.approx(wanted.torch.work_angle_rad, abs=0.1 * DEG)
+        assert found.deflection.axial_d_m == pytest.approx(wanted.deflection.axial_d_m, abs=0.1 * MM)
+    lean = plan.config.torch.work_angle_rad / DEG
+    end = 1.0 if restart else 0.18 / whole.length
+    assert lean == pytest.approx(-5.0 + 5.0 * (begins / whole.length + end), abs=0.1)
 
 
 def _named(text: str, words: str) -> tuple[float, float]:

@@ -39,8 +39,11 @@ BEND_M, BEND_TILT_RAD = 2e-5, math.radians(0.1)  # second difference from knot t
 SHOWN_GAP = 1.5  # point distances: a narrower gap is not told from the distance of two points
 EDGE_SIGMA = 0.3  # of the middle between the outermost points of two edges, in point distances
 SIGMA_FLOOR_M = 3e-5  # a third of a scan's noise of 0.1 mm, of which neighbours share a part
-WINDOW_M, STRIP_M = 0.010, 0.0009  # of the seam, for a place of the fit-up and for one end of a side's points
+WINDOW_M = 0.010  # of the seam, for a place of the fit-up
 CORRELATED = 6.0  # neighbouring points share their noise
+BANDS = tuple(0.004 * k for k in range(-4, 5))  # slopes of a gap's middle: 3 mm along 150 mm, and a registration askew
+STRAY = 5.0  # times the usual distance to the nearest point: exp(-5) of the points of a face are as alone
+EDGE_LOST_M = 1e-4  # measured on cast scans that lose 40 % of the points at an edge over 6 mm of depth
 SLOPE_FLOOR = math.radians(0.1)
 KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known better was measured
 
@@ -387,7 +390,7 @@ def _fit_up_at(
     found = {"angle": (angle, math.hypot(left.sigma[1], right.sigma[1]))}
     if seam.joint == "butt":
         found["misalignment"] = float(left.line[0] - right.line[0]), math.hypot(left.sigma[0], right.sigma[0])
-        found["gap"] = _opening(np.vstack([left.rows, right.rows]), pitch)
+        found["gap"] = _opening(np.vstack([left.rows, right.rows]))
         return found
     # Directions of the walls as they are, and where they meet.
     d = np.array([side.along + side.line[1] * side.out for side in (left, right)])
@@ -402,32 +405,33 @@ def _fit_up_at(
     return found
 
 
-def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
+def _opening(rows: Floats) -> tuple[float, float]:
     """Compute the width m of the gap between level faces, and its sigma.
 
-    By the widest step across the seam between points (M,3) of both, in strips.
+    It is the widest band along the seam without a point of both (M,3), apart from one stray point. Each of its ends
+    lies between two points: by their distances L across the seam, half of E[L^2] / E[L] from the nearest on average.
     """
-    widest, usual = [], []
-    for x in _strips(rows[:, 0], rows[:, 2]):
+    widest, gap, sigma = 0.0, math.nan, math.nan
+    for slope in BANDS:
+        x = np.unique(rows[:, 0] - slope * rows[:, 2])
+        if not x[0] < -MOST_M < MOST_M < x[-1]:
+            continue
         steps = np.diff(x)
         near = np.abs(x[:-1] + 0.5 * steps) < 2.0 * MOST_M
-        if np.count_nonzero(near) > 3 and (x < 0.0).any() and (x > 0.0).any():
-            widest.append(float(steps[near].max()))
-            usual.append(float(np.median(steps)))
-    if len(widest) < 5:
-        return math.nan, math.nan
-    gaps = np.array(widest) - np.median(usual)
-    gaps = gaps[np.abs(gaps - np.median(gaps)) < 2.0 * pitch]
-    return max(0.0, float(gaps.mean())), math.hypot(float(gaps.std()) / math.sqrt(len(gaps)), EDGE_SIGMA * pitch)
+        near[[0, -1]] = False
+        k = int(np.argmax(np.where(near, steps, 0.0)))
+        rest, end_sigma = _rest(np.delete(steps, k))
+        width = float(steps[k]) + max((d for d in steps[[k - 1, k + 1]] if d > STRAY * rest), default=0.0)
+        if width > widest:
+            widest, gap, sigma = width, max(0.0, width - 2.0 * rest), math.sqrt(2.0) * end_sigma
+    return gap, sigma
 
 
-def _strips(x: Floats, s: Floats) -> list[Floats]:
-    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once.
-
-    A point may be of both sides.
-    """
-    strip = np.floor(s / STRIP_M)
-    return [np.unique(x[strip == k]) for k in np.unique(strip)]
+def _rest(steps: Floats) -> tuple[float, float]:
+    """Compute how far the nearest of points lies from a line on average, m, and its sigma, by the points' distances."""
+    mean, two, three = (float(np.mean(steps**n)) for n in (1, 2, 3))
+    rest = 0.5 * two / mean
+    return rest, math.sqrt(max(0.0, three / (3.0 * mean) - rest**2) + 0.5 * EDGE_LOST_M**2)
 
 
 def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> tuple[float, float]:
@@ -440,20 +444,12 @@ def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> t
     flat = side.rows[:, :2] - root
     slant = abs(d[0] * other[1] - d[1] * other[0])
     a, away = flat @ d, np.abs(flat[:, 0] * other[1] - flat[:, 1] * other[0])
-    ends, steps = [], []
-    for one in _strips(a[away > clear], side.rows[away > clear, 2]):
-        if len(one) >= 3:
-            ends.append(one[0])
-            steps.append(float(np.median(np.diff(one))))
-    if len(ends) < 5:
+    x = np.unique(a[away > clear])
+    if len(x) < 20:
         return math.nan, math.nan
-    found, step = np.array(ends), float(np.median(steps))
-    found = found[np.abs(found - np.median(found)) < 2.0 * step]
-    end, sigma = (
-        float(found.mean()) - 0.5 * step,
-        math.hypot(float(found.std()) / math.sqrt(len(found)), EDGE_SIGMA * step),
-    )
-    return (0.0 if end < clear / slant + sigma else end), sigma
+    rest, sigma = _rest(np.diff(x))
+    end, hidden = float(x[0]) - rest, clear / slant
+    return (0.0, math.hypot(sigma, hidden / math.sqrt(3.0))) if end < hidden + sigma else (end, sigma)
 
 
 def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | None = None) -> tuple[float, float, float]:
