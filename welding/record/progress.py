@@ -53,7 +53,7 @@ class Progress:
         folders: results of the runs, this one last; continued_in: that of the run that went on from here.
         stretches: that are welded, in order.
         seam, piece: numbers from 0 of what is welded next, or again from its crater; done: nothing is.
-        p_BCrater, felt, X_BP, sigma_m: see Restart.
+        p_BCrater, p_BBegin, felt, X_BP, sigma_m: see Restart.
         X_BC: (4, 4), pose of the scanner; None: not known.
     """
 
@@ -68,6 +68,7 @@ class Progress:
     piece: int = 0
     done: bool = False
     p_BCrater: Array | None = None
+    p_BBegin: Array | None = None
     felt: Array | None = None
     X_BP: Array | None = None
     sigma_m: float = math.nan
@@ -79,6 +80,7 @@ class Progress:
             seam=self.seam,
             piece=self.piece,
             p_BCrater=self.p_BCrater,
+            p_BBegin=self.p_BBegin,
             felt=self.felt,
             X_BP=self.X_BP,
             sigma_m=self.sigma_m,
@@ -105,7 +107,7 @@ class Progress:
         write_durable(folder / PROGRESS_NAME, json.dumps(document, allow_nan=False) + "\n")
 
 
-_ARRAYS = {"p_BCrater": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
+_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
 
 
 def load_progress(folder: Path) -> Progress:

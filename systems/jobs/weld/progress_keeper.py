@@ -19,6 +19,7 @@ from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.runner import Run
 from weldcal.welding.record.progress import Progress, Stretch, load_progress
+from weldcal.welding.servo.feel_start import mean_residual
 from weldcal.welding.servo.state import Phase, WeldingState
 
 RESTART: Final = "restart"
@@ -27,6 +28,7 @@ EVERY_M, EVERY_S = 0.2e-3, 0.5  # a choice: with the time of writing a kill lose
 _FELT_EVERY_M = 0.5e-3  # a choice: points are needed so much more rarely, and cost more time
 _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need again
 _SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
+_FIRST = 8  # points: as many as the servo takes for what its plan is off
 _LONGEST_LAG_M = 2.0e-3  # a choice: the farthest that friction has held a tip back
 
 
@@ -113,6 +115,8 @@ class ProgressKeeper:
             if (found.seam, found.piece) != (seam, piece) or found.X_BP is None or not found.stretches:
                 X_BP = None if planned.X_BP is None else planned.X_BP.GetAsMatrix4()
                 found = replace(found, seam=seam, piece=piece, X_BP=X_BP, sigma_m=planned.part_sigma_m)
+            if found.p_BBegin is None:
+                found = replace(found, p_BBegin=p_BCrater)
             self._progress = found.with_stretch(self._stretch(run, done=False))
             self._at, self._time = s, run.seconds
             self._put(state)
@@ -123,7 +127,7 @@ class ProgressKeeper:
         later = (*order[order.index(command.seam) + 1 :], len(order))
         seam, piece = (command.seam, command.piece + 1) if planned.more else (later[0], 0)
         done = seam >= len(order)
-        self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, felt=None)
+        self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, p_BBegin=None, felt=None)
         self._put(None)
 
     def _stretch(self, run: Run[WeldJob], done: bool) -> Stretch:
@@ -193,7 +197,10 @@ class ProgressKeeper:
 
 
 def felt_points(state: WeldingState) -> Array | None:
-    """The points (N, 4) m in B that were felt from a little behind the torch on, and their lag; None without any."""
+    """The points (N, 4) m in B that were felt from a little behind the torch on, and their lag; None without any.
+
+    Before the first one stand points of the path that the torch followed there: the plan, as far off as the first ones.
+    """
     seam = state.refined
     if state.plan_fit is None or not len(seam):
         return None
@@ -207,4 +214,10 @@ def felt_points(state: WeldingState) -> Array | None:
             spaced.append(k)
     points, arc = seam.points[spaced], seam.arc[spaced]
     lag = np.clip(arc - curve.project(points), 0.0, _LONGEST_LAG_M)
-    return np.column_stack([points, lag])
+    rows = np.column_stack([points, lag])
+    if keep[0] > 0:
+        return rows
+    s = np.arange(max(state.s_torch - _BEHIND_M, 0.0), float(curve.project(points[0])) - _SPACING_M, _SPACING_M)
+    aside, above = mean_residual(seam.points[:_FIRST], curve, float(s[-1])) if len(s) else (0.0, 0.0)
+    before = curve.position(s) + aside * curve.normal(s) + above * curve.up(s)
+    return np.vstack([np.column_stack([before, np.full(len(s), lag[0])]), rows])
