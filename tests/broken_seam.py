@@ -65,7 +65,9 @@ class Broken:
             self.written = state.s_torch
             crater = np.asarray(sample.X_BT @ config.p_TW)
             stretch = Stretch(seam=0, piece=0, run=0, from_m=0.0, to_m=state.s_torch, done=False, time="")
-            self.newest = replace(self.newest.with_stretch(stretch), p_BCrater=crater, felt=felt_points(state))
+            begin = crater if self.newest.p_BBegin is None else self.newest.p_BBegin
+            found = replace(self.newest.with_stretch(stretch), p_BCrater=crater, p_BBegin=begin)
+            self.newest = replace(found, felt=felt_points(state))
         return state, command
 
 
@@ -121,11 +123,12 @@ def broken_off(name: str, at_m: float, kind: str, seed: int, budget: Budget, mov
         run = welded(seam, budget, seed, Paused(at_m), plans[0], None)
         error = path_error(run.points("torch")[run.column("torch_on") > 0.5], run.torch_line)
         k = int(np.argmin(np.diff(error.s)))
-        return joined(error.s[k], error.s[k + 1 :], error.distance_m[k + 1 :], PAUSE_OVERLAP_M, run.state.reason)
+        place = (float(error.s[0]), float(error.s[k]))
+        return joined(place, error.s[k + 1 :], error.distance_m[k + 1 :], PAUSE_OVERLAP_M, run.state.reason)
     first = Broken(at_m, kind)
     run = welded(seam, budget, seed, first, plans[0], None)
     error = path_error(run.points("torch")[run.column("torch_on") > 0.5], run.torch_line)
-    crater = float(error.s[-1])
+    place = (float(error.s[0]), float(error.s[-1]))
     with tempfile.TemporaryDirectory() as folder:
         first.newest.write(Path(folder))
         restart = load_progress(Path(folder)).restart(OVERLAP_M)
@@ -137,13 +140,17 @@ def broken_off(name: str, at_m: float, kind: str, seed: int, budget: Budget, mov
     if not on.any():
         return Join(math.inf, math.inf, again.reason or again.state.reason)
     error = path_error(again.points("torch")[on], again.torch_line)
-    return joined(crater, error.s, error.distance_m, OVERLAP_M, again.state.reason)
+    return joined(place, error.s, error.distance_m, OVERLAP_M, again.state.reason)
 
 
-def joined(crater: float, s: Array, distance: Array, overlap_m: float, reason: str | None) -> Join:
-    """The join of the run that went on: where its torch was along the seam (n,) m, and how far from it (n,) m."""
+def joined(arc: tuple[float, float], s: Array, distance: Array, overlap_m: float, reason: str | None) -> Join:
+    """The join of the run that went on: where its torch was along the seam (n,) m, and how far from it (n,) m.
+
+    `arc`: where the first one began and where it went out, m; before its beginning nothing is to be welded.
+    """
+    begin, crater = arc
     near = np.abs(s - crater) < NEAR_M
-    return Join(1e3 * float(distance[near].max()), 1e3 * (float(s[0]) - max(crater - overlap_m, 0.0)), reason)
+    return Join(1e3 * float(distance[near].max()), 1e3 * (float(s[0]) - max(crater - overlap_m, begin)), reason)
 
 
 def main(times: int, seed: int, budget: Budget) -> int:

@@ -317,7 +317,7 @@ class WeldingConfig:
     # CSV of limits of gap, misalignment and angle along the seam: out of them it is not welded
     fit_up: str | None = dc.field(default=None, metadata=FILE)
     seam_order: str = "given"  # given: as listed; least_travel: with the least way of the tool between the seams
-    # home: the arm goes home and scans the part again; direct: it goes to the next seam, by home only where it must
+    # home: the arm goes home and scans the part again; direct: to the next seam that the tip feels, by home if it must
     between_seams: str = "home"
     # where something that the drawing does not have is in the way, the seam is interrupted; else it is not welded
     pass_obstacles: bool = False

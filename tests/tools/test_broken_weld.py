@@ -61,13 +61,20 @@ def test_what_cannot_go_on_is_refused(broken: Path) -> None:
     assert "holds no broken weld" in resumed(broken / RESTART)
 
 
-def test_later_passes_are_not_welded_along_a_part_of_the_root(tmp_path: Path) -> None:
-    scenario = load_scenario("straight_groove", "welding: {passes: [{vertical_mm: 3.0}]}")
+@pytest.mark.parametrize(
+    ("welding", "refused"),
+    [
+        ("passes: [{vertical_mm: 3.0}]", "of several passes cannot go on"),
+        ("stitch: {on_mm: 20, off_mm: 20}", "of stitches can go on only with"),
+    ],
+)
+def test_what_no_single_crater_describes_is_not_resumed(tmp_path: Path, welding: str, refused: str) -> None:
+    scenario = load_scenario("straight_groove", f"welding: {{{welding}}}")
     for name, data in packed(scenario).items():
         write_apart(tmp_path / RESTART / name, data)
     for done in (False, True):  # the root's end is not the weld's
         state(tmp_path, done=done).write(tmp_path)
-        assert "of several passes cannot go on" in resumed(tmp_path)
+        assert refused in resumed(tmp_path)
 
 
 def test_a_weld_whose_process_was_killed_goes_on() -> None:

@@ -81,6 +81,10 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     scenario = load_scenario(str(folder / RESTART / SCENARIO))
     if scenario.welding.passes:  # the path that a later pass follows was felt by several runs
         raise ProgressError("A broken weld of several passes cannot go on: weld the rest by hand.")
+    if scenario.welding.stitch is not None and not scenario.welding.stitch.stitch().middle_out:
+        raise ProgressError(
+            "A broken weld of stitches can go on only with welding.stitch.order: middle_out: weld the rest by hand."
+        )
     if progress.done:
         raise ProgressError(f"The weld in '{folder}' is complete: nothing is left to weld.")
     if not (live.get("browser") or sys.stdin.isatty()):

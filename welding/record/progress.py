@@ -15,7 +15,7 @@ from weldcal.welding.numerics import Array
 from weldcal.welding.seam.restart import Restart
 
 SCHEMA, VERSION = "weldcal weld progress", 1
-PROGRESS_NAME = "progress.json"
+PROGRESS_NAME, CRATERS_NAME = "progress.json", "craters.jsonl"
 
 
 class ProgressError(InputError):
@@ -41,6 +41,14 @@ class Stretch:
     done: bool
     time: str
 
+    def same_arc(self, other: Self) -> bool:
+        """Whether the other one has the same beginning in the same run."""
+        return all(getattr(self, k) == getattr(other, k) for k in ("seam", "piece", "run", "from_m"))
+
+    def line(self, p_BCrater: Array) -> str:
+        """The line of the crater record: this stretch, and the torch (3,) m at its end."""
+        return json.dumps([*vars(self).values(), *np.round(p_BCrater, 6).tolist()]) + "\n"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Progress:
@@ -52,7 +60,7 @@ class Progress:
         folders: results of the runs, this one last; continued_in: that of the run that went on from here.
         stretches: that are welded, in order.
         seam, piece: numbers from 0 of what is welded next, or again from its crater; done: nothing is.
-        p_BCrater, felt, X_BP, sigma_m: see Restart.
+        p_BCrater, p_BBegin, felt, X_BP, sigma_m: see Restart.
         X_BC: (4, 4), pose of the scanner; None: not known.
     """
 
@@ -67,6 +75,7 @@ class Progress:
     piece: int = 0
     done: bool = False
     p_BCrater: Array | None = None
+    p_BBegin: Array | None = None
     felt: Array | None = None
     X_BP: Array | None = None
     sigma_m: float = math.nan
@@ -78,6 +87,7 @@ class Progress:
             seam=self.seam,
             piece=self.piece,
             p_BCrater=self.p_BCrater,
+            p_BBegin=self.p_BBegin,
             felt=self.felt,
             X_BP=self.X_BP,
             sigma_m=self.sigma_m,
@@ -88,9 +98,22 @@ class Progress:
         """The progress with a new stretch, or with a newer end of the last one."""
         kept = self.stretches
         last = kept[-1] if kept else None
-        same = last is not None and not last.done
-        same = same and all(getattr(last, k) == getattr(stretch, k) for k in ("seam", "piece", "run", "from_m"))
+        same = last is not None and not last.done and last.same_arc(stretch)
         return replace(self, stretches=(*(kept[:-1] if same else kept), stretch))
+
+    def with_crater(self, line: bytes) -> Self:
+        """The progress with a line of the crater record, where it is farther on the seam whose turn it is."""
+        try:
+            *values, x, y, z = json.loads(line)
+            stretch = Stretch(**dict(zip(Stretch.__annotations__, values, strict=True)))
+            p_BCrater = np.array((x, y, z), dtype=float)
+        except (TypeError, ValueError):
+            return self
+        last, here = self.stretches[-1] if self.stretches else None, (self.seam, self.piece, len(self.folders) - 1)
+        old = last is not None and last.same_arc(stretch) and (last.done or last.to_m >= stretch.to_m)
+        if self.done or old or (stretch.seam, stretch.piece, stretch.run) != here:
+            return self
+        return replace(self.with_stretch(stretch), p_BCrater=p_BCrater)
 
     def write(self, folder: Path) -> None:
         """Write progress.json, so that it survives a loss of power."""
@@ -104,7 +127,8 @@ class Progress:
         write_durable(folder / PROGRESS_NAME, json.dumps(document, allow_nan=False) + "\n")
 
 
-_ARRAYS = {"p_BCrater": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
+_LAST_LINES = 20  # a choice: a loss of power may damage the last ones
+_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
 
 
 def load_progress(folder: Path) -> Progress:
@@ -126,7 +150,7 @@ def load_progress(folder: Path) -> Progress:
     try:
         arrays: dict[str, Any] = {name: _array(document[name], shape) for name, shape in _ARRAYS.items()}
         sigma = document["sigma_mm"]
-        return Progress(
+        found = Progress(
             scenario=str(document["scenario"]),
             scenario_sha256=str(document["scenario_sha256"]),
             continued_in=str(document["continued_in"]),
@@ -140,6 +164,11 @@ def load_progress(folder: Path) -> Progress:
             sigma_m=math.nan if sigma is None else 1e-3 * as_number(sigma),
             **arrays,
         )
+        craters = folder / CRATERS_NAME
+        lines = craters.read_bytes().split(b"\n")[:-1] if craters.is_file() else []
+        for line in lines[-_LAST_LINES:]:
+            found = found.with_crater(line)
+        return found
     except (KeyError, TypeError, ValueError) as problem:
         raise ProgressError(f"{path} is damaged ({problem}): weld the rest by hand.") from None
 

@@ -15,6 +15,7 @@ MOVED_M = 1.0e-3  # a choice: two scans show such a move; the touch shows half o
 SURE = 3.0  # sigma of the difference of two registrations, below which no part has moved
 BEHIND_M = 4.0e-3  # a choice: half a weld pool and the tip's radius, so that the tip meets the open groove
 SPARE_M = 0.5e-3  # a choice: the rest is splined anew, and its length changes by less
+NEAR_START_M = 20e-3  # as far as the servo looks for the start
 _KNOT_M = 0.5e-3  # as the pieces of an interrupted seam
 
 
@@ -33,6 +34,7 @@ class Restart:
     Attributes:
         seam, piece: numbers from 0 of the seam, and of its piece, that is not finished.
         p_BCrater: (3,) m, the torch where the arc went out; None: it has not burned on this seam.
+        p_BBegin: (3,) m, the torch where the arc was first lit on it; None: at the planned start.
         felt: (N, 4) m in B: the points that the tip felt beside the crater and ahead of it, and their lag.
         X_BP: (4, 4), registered pose of the part then; None: not known. sigma_m: of that registration.
         overlap_m: of seam that is welded twice.
@@ -41,6 +43,7 @@ class Restart:
     seam: int
     piece: int = 0
     p_BCrater: Array | None = None
+    p_BBegin: Array | None = None
     felt: Array | None = None
     X_BP: Array | None = None
     sigma_m: float = math.nan
@@ -68,7 +71,9 @@ class Restart:
             )
 
     def cut(self, seam: SeamCurve, chord_m: float, run_up_m: float, window_m: float, from_m: float = 0.0) -> "CutSeam":
-        """The rest of a seam, from `overlap_m` before its crater.
+        """The rest of a seam, from `overlap_m` before its crater, but not from before its first arc.
+
+        A new scan may place the planned start a few millimetres beside the one that was welded.
 
         Args:
             seam: the planned line in B, with what the groove goes on behind it.
@@ -82,7 +87,8 @@ class Restart:
         if self.p_BCrater is None:
             return CutSeam(seam, None, from_m, from_m)
         crater = float(seam.project(self.p_BCrater))
-        start = min(max(0.0, crater - self.overlap_m), seam.length)
+        begin = 0.0 if self.p_BBegin is None else seam.nearest(self.p_BBegin, 0.0, NEAR_START_M)
+        start = min(max(begin, crater - self.overlap_m), seam.length)
         last = seam.drawn_m if seam.drawn_m > seam.length + window_m else seam.length
         down = min(start + chord_m - run_up_m, last - window_m - SPARE_M)
         if down < crater + BEHIND_M:

@@ -251,7 +251,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         X_FR, standard = feature_on_flange(scenario, station), feature_standard(scenario)
         X_BC_guess = c.mounting_guess.pose()
         travel = travel_of(scenario, station)
-        times = replace(job_plan(scenario, station.cad), order=travel.order)
+        times = replace(job_plan(scenario, station.cad), order=travel.order, unfelt=unfelt_seams(station))
         sequencer = wiring.add("job_sequencer", JobSequencer(times))
         command, history = sequencer.GetOutputPort("job"), spine.arm.history
         estimator = wiring.add(
@@ -353,6 +353,14 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     )
 
 
+def unfelt_seams(station: Station) -> tuple[int, ...]:
+    """The numbers, from 0, of the seams that the station's tip does not feel."""
+    part, tool = station.cad, station.tool
+    if part is None or tool is None:
+        return ()
+    return tuple(k for k in range(seam_count(part)) if not is_felt(numbered(part, k), tool))
+
+
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
 ) -> tuple[OutputPort, OutputPort, dict[str, Any]]:
@@ -374,9 +382,7 @@ def _add_welding(
     position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
     carried = scenario.carried_scanner()
-    if kind is DrawnSeamPlanner and not all(
-        is_felt(numbered(station.cad, k), tool) for k in range(seam_count(station.cad))
-    ):
+    if kind is DrawnSeamPlanner and unfelt_seams(station):
         raise InputError(
             "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write"
             " workpiece.located_by: scan."

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import os
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,15 +19,17 @@ from weldcal.systems.jobs.weld.settings import seam_tool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.runner import Run
-from weldcal.welding.record.progress import Progress, Stretch, load_progress
+from weldcal.welding.record.progress import CRATERS_NAME, Progress, Stretch, load_progress
+from weldcal.welding.servo.feel_start import mean_residual
 from weldcal.welding.servo.state import Phase, WeldingState
 
 RESTART: Final = "restart"
 """Folder of a result with the files of its scenario, from which the weld can go on."""
-EVERY_M, EVERY_S = 0.2e-3, 0.5  # a choice: with the time of writing a kill loses less than 1 mm at 16 mm/s
-_FELT_EVERY_M = 0.5e-3  # a choice: points are needed so much more rarely, and cost more time
+EVERY_M, EVERY_S = 1.0e-3, 0.5  # a choice: the points that a restart needs are felt long before
+CRATER_M = 0.1e-3  # a choice: a tenth of what a restart may be off along the seam
 _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need again
 _SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
+_FIRST = 8  # points: as many as the servo takes for what its plan is off
 _LONGEST_LAG_M = 2.0e-3  # a choice: the farthest that friction has held a tip back
 
 
@@ -39,9 +42,10 @@ def sha256_of(files: Mapping[str, bytes]) -> str:
 
 
 class ProgressKeeper:
-    """Looks at a run that welds, and writes its progress by a thread of its own: the run does not wait for the disk.
+    """Looks at a run that welds, and writes its progress by threads of its own: the run does not wait for the disk.
 
-    The result folder gets `progress.json` and the folder `restart` when the arm goes to the first seam.
+    The result folder gets `progress.json` and the folder `restart` when the arm goes to the first seam. A second thread
+    appends the place of the burning arc to `craters.jsonl`, for the other file is rewritten too slowly.
     """
 
     def __init__(self, folder: Path, files: Mapping[str, bytes], begun: Progress) -> None:
@@ -56,8 +60,9 @@ class ProgressKeeper:
         self._from_m, self._to_m, self._at, self._time = math.nan, -math.inf, -math.inf, -math.inf
         self._plan, self._ended, self._lit = (0, 0, 0), (0, 0, 0), False
         self._slot: tuple[Progress, WeldingState | None] | None = None
+        self._line, self._line_m = "", -math.inf
         self._changed, self._closing = threading.Condition(), False
-        self._thread: threading.Thread | None = None
+        self._threads: tuple[threading.Thread, ...] = ()
         self._problem: Exception | None = None
 
     @property
@@ -69,14 +74,16 @@ class ProgressKeeper:
         """See run_cell."""
         job, root = run.cell.job, run.root
         phase = job.command(root).phase
-        if self._thread is None:
+        if not self._threads:
             if phase in ("confirm", "approach_above"):
                 stated = run.cell.scenario.job.X_BC
                 X_BC = job.calibration_status(root).X_BC or (None if stated is None else stated.pose())
                 if X_BC is not None:
                     self._progress = replace(self._progress, X_BC=X_BC.GetAsMatrix4())
-                self._thread = threading.Thread(target=self._write, name="progress", daemon=True)
-                self._thread.start()
+                work = {"progress": self._write, "craters": self._append}
+                self._threads = tuple(threading.Thread(target=w, name=n, daemon=True) for n, w in work.items())
+                for thread in self._threads:
+                    thread.start()
                 self._put(None)
             return
         report, planned = job.servo_report(root), job.planned_seam(root)
@@ -84,6 +91,7 @@ class ProgressKeeper:
             return
         if report.plan_key != self._plan:
             self._plan, self._from_m, self._to_m, self._at = report.plan_key, math.nan, -math.inf, -math.inf
+            self._line_m = -math.inf
         state = report.state
         lit = phase == "weld" and report.torch_on and state is not None and state.arc_seen
         if state is not None and (lit or self._lit):
@@ -106,6 +114,11 @@ class ProgressKeeper:
         if lit and s > self._to_m:
             self._to_m = s
             self._progress = replace(self._progress, p_BCrater=p_BCrater)
+            if s > self._line_m + CRATER_M:
+                self._line_m = s
+                with self._changed:
+                    self._line = self._stretch(run, done=False).line(p_BCrater)
+                    self._changed.notify_all()
         late = run.seconds - self._time > EVERY_S and s > self._at
         if lit != self._lit or s > self._at + EVERY_M or late:
             seam, piece = run.command.seam, run.command.piece
@@ -113,6 +126,8 @@ class ProgressKeeper:
             if (found.seam, found.piece) != (seam, piece) or found.X_BP is None or not found.stretches:
                 X_BP = None if planned.X_BP is None else planned.X_BP.GetAsMatrix4()
                 found = replace(found, seam=seam, piece=piece, X_BP=X_BP, sigma_m=planned.part_sigma_m)
+            if found.p_BBegin is None:
+                found = replace(found, p_BBegin=p_BCrater)
             self._progress = found.with_stretch(self._stretch(run, done=False))
             self._at, self._time = s, run.seconds
             self._put(state)
@@ -123,7 +138,7 @@ class ProgressKeeper:
         later = (*order[order.index(command.seam) + 1 :], len(order))
         seam, piece = (command.seam, command.piece + 1) if planned.more else (later[0], 0)
         done = seam >= len(order)
-        self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, felt=None)
+        self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, p_BBegin=None, felt=None)
         self._put(None)
 
     def _stretch(self, run: Run[WeldJob], done: bool) -> Stretch:
@@ -140,7 +155,7 @@ class ProgressKeeper:
     def _put(self, state: WeldingState | None) -> None:
         with self._changed:
             self._slot = self._progress, state
-            self._changed.notify()
+            self._changed.notify_all()
 
     def close(self, run: Run[WeldJob] | None = None) -> None:
         """Write the newest progress, that of a run's end where it has one, and end the thread.
@@ -148,20 +163,37 @@ class ProgressKeeper:
         Raises:
             OSError: the disk took no progress.
         """
-        if self._thread is None:
+        if not self._threads:
             return
         if run is not None and run.interrupted is not None and self._lit:
             self._at = -math.inf
             self.look(run)
         with self._changed:
             self._closing = True
-            self._changed.notify()
-        self._thread.join()
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
         if self._problem is not None:
             raise self._problem
 
+    def _append(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with (self._folder / CRATERS_NAME).open("w") as file:
+                while True:
+                    with self._changed:
+                        self._changed.wait_for(lambda: self._line or self._closing)
+                        line, self._line = self._line, ""
+                    if not line:
+                        return
+                    file.write(line)
+                    file.flush()
+                    os.fsync(file.fileno())
+        except Exception as problem:  # as _write
+            self._problem = problem
+
     def _write(self) -> None:
-        marked, felt, felt_at = False, None, -math.inf
+        marked = False
         try:
             for name, data in self._files.items():
                 write_apart(self._folder / RESTART / name, data)
@@ -174,9 +206,7 @@ class ProgressKeeper:
                     return
                 progress, state = slot
                 if state is not None:
-                    if abs(state.torch_arc - felt_at) > _FELT_EVERY_M:  # below 0 in a new seam
-                        felt, felt_at = felt_points(state), state.torch_arc
-                    progress = replace(progress, felt=felt)
+                    progress = replace(progress, felt=felt_points(state))
                 progress.write(self._folder)
                 if state is not None and not marked:
                     self._mark_earlier()
@@ -193,7 +223,10 @@ class ProgressKeeper:
 
 
 def felt_points(state: WeldingState) -> Array | None:
-    """The points (N, 4) m in B that were felt from a little behind the torch on, and their lag; None without any."""
+    """The points (N, 4) m in B that were felt from a little behind the torch on, and their lag; None without any.
+
+    Before the first one stand points of the path that the torch followed there: the plan, as far off as the first ones.
+    """
     seam = state.refined
     if state.plan_fit is None or not len(seam):
         return None
@@ -207,4 +240,10 @@ def felt_points(state: WeldingState) -> Array | None:
             spaced.append(k)
     points, arc = seam.points[spaced], seam.arc[spaced]
     lag = np.clip(arc - curve.project(points), 0.0, _LONGEST_LAG_M)
-    return np.column_stack([points, lag])
+    rows = np.column_stack([points, lag])
+    if keep[0] > 0:
+        return rows
+    s = np.arange(max(state.s_torch - _BEHIND_M, 0.0), float(curve.project(points[0])) - _SPACING_M, _SPACING_M)
+    aside, above = mean_residual(seam.points[:_FIRST], curve, float(s[-1])) if len(s) else (0.0, 0.0)
+    before = curve.position(s) + aside * curve.normal(s) + above * curve.up(s)
+    return np.vstack([np.column_stack([before, np.full(len(s), lag[0])]), rows])

@@ -45,6 +45,7 @@ class JobPlan:
     seams: int = 1
     order: tuple[int, ...] = ()  # their numbers, from 0, in the order of welding; empty: as listed
     direct: bool = False  # to the next seam without a new scan, and without home where the way is free
+    unfelt: tuple[int, ...] = ()  # seams that only the scan locates: each is scanned again
     interpass_s: tuple[float, ...] = ()  # of each pass after the root
     scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
     first: tuple[int, int] | None = None  # seam and piece with which a broken weld goes on; None: a new weld
@@ -354,7 +355,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return self._onward(s, now, seam=later[0], piece=0, weld_pass=0)
 
     def _onward(self, s: JobState, now: JobInputs, **changes: int) -> JobState:
-        if self._plan.direct:
+        if self._plan.direct and changes.get("seam", s.seam) not in self._plan.unfelt:
             return self.enter(s, now, "plan_seam", **changes)
         # The part is scanned again, for the seam that was welded may have moved it.
         return self._homeward(s, now, "park", **changes)

@@ -269,6 +269,21 @@ def test_the_next_seam_of_the_order_is_planned_where_the_arm_is(free: bool) -> N
     assert world.arrive() == "home"
 
 
+@pytest.mark.parametrize("unfelt", [(), (0,), (1,)])
+def test_a_seam_that_only_the_scan_locates_is_scanned_again(unfelt: tuple[int, ...]) -> None:
+    world = World(dc.replace(PLAN, calibrate=False, seams=2, order=(0, 1), direct=True, unfelt=unfelt))
+    world.look()
+    world.arrive()
+    assert world.look(0.3, planned_seam=dc.replace(PLANNED, sequence=1)) == "approach_above"
+    world.arrive()
+    world.arrive()
+    assert world.look(20.0, servo_report=ServoReport(phase="DONE")) == "retract"
+    assert world.arrive() == ("park" if 1 in unfelt else "plan_seam")
+    if 1 in unfelt:
+        assert world.arrive() == "scan_workpiece"
+        assert (world.command.seam, world.command.scan_sequence) == (1, 2)
+
+
 @pytest.mark.parametrize("calibrate", [True, False])
 def test_an_arm_that_stands_elsewhere_goes_home_first(calibrate: bool) -> None:
     world = World(dc.replace(PLAN, calibrate=calibrate))

@@ -10,10 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.welding.record.progress import PROGRESS_NAME, Progress, ProgressError, Stretch, load_progress
+from weldcal.welding.record.progress import CRATERS_NAME, PROGRESS_NAME, Progress, ProgressError, Stretch, load_progress
 from weldcal.welding.record.weld_log import WeldRecord
 
 BEGUN = Progress(scenario="mine", seed=3, robot=None, scenario_sha256="abc", folders=("/a", "/b"))
+
+
+LINES: tuple[tuple[float, dict[str, object]], ...] = (
+    (0.119, {}),
+    (0.124, {}),
+    (0.125, {}),
+    (0.15, {"seam": 2}),
+    (0.16, {"run": 0}),
+)
 
 
 def stretch(to_m: float, **more: object) -> Stretch:
@@ -38,6 +47,28 @@ def test_the_progress_comes_back_from_its_file(tmp_path: Path) -> None:
     restart = found.restart(6e-3)
     assert (restart.seam, restart.overlap_m) == (1, 6e-3)
     assert restart.sigma_m == pytest.approx(2e-4)
+
+
+def test_the_crater_record_is_newer_than_the_progress(tmp_path: Path) -> None:
+    made = replace(BEGUN.with_stretch(stretch(0.12)), seam=1, p_BCrater=np.array([0.1, 0.2, 0.3]))
+    made.write(tmp_path)
+    lines = [stretch(to_m, **more).line(np.array([to_m, 0.2, 0.3])) for to_m, more in LINES]
+
+    def crater(*parts: str) -> float:
+        (tmp_path / CRATERS_NAME).write_text("".join(parts))
+        found = load_progress(tmp_path)
+        assert found.p_BCrater is not None
+        assert found.stretches[-1].to_m == pytest.approx(max(0.12, float(found.p_BCrater[0])))
+        return float(found.p_BCrater[0])
+
+    old, new, newer, other_seam, earlier_run = lines
+    assert crater(old) == 0.1
+    assert crater(old, new, newer) == 0.125
+    assert crater(old, new, newer[:-1]) == 0.124, "a line that was not written to its end"
+    assert crater(old, new, "\0\0\n") == 0.124
+    assert crater(new, other_seam, earlier_run) == 0.124
+    replace(made, seam=2, p_BCrater=np.array([0.1, 0.2, 0.3])).write(tmp_path)
+    assert crater(new, newer) == 0.1, "that seam is finished"
 
 
 def test_a_stretch_grows_until_its_seam_ends() -> None:

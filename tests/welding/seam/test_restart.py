@@ -38,6 +38,16 @@ def test_a_crater_near_the_start_begins_the_seam_anew() -> None:
     )
 
 
+def test_nothing_before_the_first_arc_is_welded() -> None:
+    # a new scan places the seam's start 2 mm late, or 2 mm early
+    for begin_m in (-0.002, 0.002):
+        cut = broken_at(0.006, p_BBegin=np.array([begin_m, 0.4e-3, -4e-3])).cut(SEAM, CHORD_M, RUN_UP_M, WINDOW_M)
+        assert cut.start_m == pytest.approx(begin_m, abs=1e-6)
+        assert cut.line.position(0.0) == pytest.approx([begin_m, 0.0, 0.0], abs=1e-6)
+        assert cut.line.length == pytest.approx(SEAM.length - begin_m, abs=1e-6)
+    assert broken_at(0.1, p_BBegin=np.zeros(3)).cut(SEAM, CHORD_M, RUN_UP_M, WINDOW_M).start_m == pytest.approx(0.092)
+
+
 def test_the_tip_touches_the_open_groove_or_nothing() -> None:
     last = SEAM.length - WINDOW_M - BEHIND_M - SPARE_M
     cut = broken_at(last - 1e-4).cut(SEAM, CHORD_M, RUN_UP_M, WINDOW_M)
