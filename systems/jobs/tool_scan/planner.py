@@ -65,7 +65,7 @@ def check_tool_scan(scenario: Scenario) -> None:
         raise InputError("A tool scan needs a welding tool: write tool: {file: my_tool.yaml} in the scenario.")
     if not config.result or not Path(config.result).exists():
         raise InputError(
-            f"tool_scan.result must be a result of weldcal calibrate, and there is none at '{config.result}'."
+            f"There is no result of weldcal calibrate at '{config.result}': correct --calibration, or tool_scan.result."
         )
     if not FEWEST <= config.scans <= MOST:
         raise InputError(f"tool_scan.scans must be from {FEWEST} to {MOST}, not {config.scans}.")
