@@ -188,7 +188,7 @@ def _follow(arm: ArmModel, q: Array, motion: GuardedMotion) -> Followed:
         check_joints(arm, found, where)
         J = tick_jacobian(arm, found, p_FT)
         weave = np.r_[motion.weave_rad_s * R[k, :, 2], np.zeros(3)]
-        for twist in (V[k] + weave, V[k] - weave) if motion.weave_rad_s else (V[k],):
+        for twist in (V[k] + weave, V[k] - weave, V[k]):  # the last one leads to the next place
             allowed = guarded_joint_velocity(J, twist, limit, GUARD)
             least_sigma, least_share = min(least_sigma, allowed.sigma_min), min(least_share, allowed.scale)
             if allowed.sigma_min < GUARD.sigma_slow and allowed.scale < motion.least_share:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.scenario.wired_orders import swings
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.scenario.loading import load_scenario
@@ -57,26 +58,12 @@ def test_the_true_torch_weaves_as_ordered(weave: str, period_s: float, tmp_path:
     off = path_error(log.p_BTorch[log.torch_on], truth)
     t = log.time[log.torch_on] - log.time[log.torch_on][0]
     rows = t > 1.5 * period_s
-    t, s, left, up = t[rows], off.s[rows], off.lateral[rows], off.height[rows]
-    tilt = np.deg2rad(order.plane_deg)
-    side = np.cos(tilt) * left + np.sin(tilt) * up
-    swings = int((t[-1] - t[0]) / period_s)
-    parts = [side[(t >= t[0] + k * period_s) & (t < t[0] + (k + 1) * period_s)] for k in range(swings)]
-    assert swings >= 2
-
-    amplitude_mm = np.mean([np.ptp(part) for part in parts]) / 2.0 / MM
+    t, s = t[rows], off.s[rows]
+    seen = swings(t, off.lateral[rows], off.height[rows], period_s, np.deg2rad(order.plane_deg))
+    side, amplitude_mm, mean = seen.side, seen.amplitude_m / MM, seen.mean_m
     assert amplitude_mm == pytest.approx(order.amplitude_mm, rel=0.03)
-    # the period whose first three harmonics fit best
-    periods = np.linspace(0.9, 1.1, 401) * period_s
-    phases = 2.0 * np.pi * np.outer(np.arange(1, 4), t)
-    left_over = []
-    for period in periods:
-        A = np.vstack([np.sin(phases / period), np.cos(phases / period), np.ones(len(t))]).T
-        left_over.append(np.sum((side - A @ np.linalg.lstsq(A, side, rcond=None)[0]) ** 2))
-    assert periods[np.argmin(left_over)] == pytest.approx(period_s, rel=0.01)
+    assert seen.period_s == pytest.approx(period_s, rel=0.01)
     # the mean path; the triangle rests on the right for a ninth of its time, with the torch at its amplitude
-    whole = t < t[0] + swings * period_s
-    mean = np.array([np.mean(left[whole]), np.mean(up[whole])])
     if order.shape == "triangle":
         mean[0] += order.amplitude_mm * MM / 9.0
     assert np.hypot(*mean) < 0.05 * MM

@@ -1,6 +1,6 @@
 """A whole order by wire with one command: three seams, root and cap, tacks, schedule, a measured torch, and the record.
 
-python -m tests.scenario.whole_order FOLDER [--seed N]
+python -m tests.scenario.whole_order FOLDER [--seed N] [--analog] [--welding "{between_seams: direct}"]
 plays the devices with `weldcal emulate-cell`, runs `weldcal weld`, and prints what the world knows of torch and part.
 """
 
@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import yaml
 
 from tests.calibration.tool.torches import Wrong, cell
@@ -27,6 +28,10 @@ from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 BENT_M, TILTED_RAD = 1.5e-3, 0.01  # of the torch against the shipped tool file
 POWER_PORT = 5021
+ANALOG = """\
+  wire_feed: {output: 0, at_full: 22.0, value: 6.0}
+  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0, value: 20.0}
+"""
 CAP = {"lateral_mm": 2.0, "vertical_mm": 3.0, "reverse": True, "interpass_s": 5.0}
 TACKS = [{"from_mm": 20.0, "to_mm": 32.0, "height_mm": 4.5, "seam": 2}]
 
@@ -50,8 +55,8 @@ def part(folder: Path) -> list[dict[str, list[int]]]:
     return [{"edges": [id]} for id in joint.edges[:3]]
 
 
-def texts(folder: Path) -> tuple[str, str]:
-    """The scenario of the world, and that of the cell."""
+def texts(folder: Path, more: dict[str, Any], *, analog: bool) -> tuple[str, str]:
+    """The scenario of the world, and that of the cell; `more` of its part `welding`."""
     pose = {"xyz_m": [0.65, 0.0, 0.015], "rpy_deg": [0.0, 0.0, 90.0]}
     piece: dict[str, Any] = {"file": str(folder / "part.step"), "seams": part(folder), "joint": "fillet"}
     piece |= {"pose_guess": pose}
@@ -63,10 +68,10 @@ def texts(folder: Path) -> tuple[str, str]:
     wires = (SCENARIO_FOLDER / f"{CELL}.yaml").read_text(encoding="utf-8")
     home = "home_deg:" + wires.split("home_deg:")[1]
     wires = wires.split("workpiece:")[0].replace("pace: 0.5", "pace: 1.0") + home
-    wires = wires.replace("  arc_input: 0\n  arc_fault_input: 1\n", "")
+    wires = wires.replace("  arc_input: 0\n  arc_fault_input: 1\n", "  arc_input: 0\n" + ANALOG if analog else "")
     order = {"order": "4711", "wps": "WPS-135-07 rev. B", "part": "block on plate", "serial": "1", "operator": "ak"}
     order |= {"limits": {"heat_input_kJ_mm": [0.1, 2.0], "speed_mm_s": [7.0, 9.0], "path_mm": 0.5}}
-    welding = {
+    welding: dict[str, Any] = {
         "order": order,
         "process": {"name": "MAG"},
         "passes": [CAP],
@@ -80,13 +85,18 @@ def texts(folder: Path) -> tuple[str, str]:
             "crater": {"wire_feed_m_min": 3.0, "voltage_V": 17.0, "ramp_s": 0.3},
         },
     }
+    if analog:
+        del welding["schedule"]["job"]
+        welding["process"] |= {"current_A": 180.0, "voltage_V": 20.0}
     cell_keys = {
         "workpiece": piece,
         "tool": {"file": str(folder / "measured.yaml")},
-        "welding": welding,
+        "welding": welding | more,
         "job": {"calibrate": False, "X_BC": yaml.safe_load(X_BC), "X_BC_sigma_mm": 0.1, "maximum_time_s": 900.0},
     }
     wires += yaml.safe_dump(cell_keys)
+    if analog:
+        return world, wires
     return world, wires + f"power_source: !ModbusPowerSource {{host: {PLAYED_HOST}, port: {POWER_PORT}}}\n"
 
 
@@ -95,11 +105,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--analog", action="store_true", help="the schedule by analog outputs, not by Modbus")
+    parser.add_argument("--welding", default="{}", metavar="YAML", help="more keys of the cell's part `welding`")
     words = parser.parse_args()
     folder = words.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     tools(folder, words.seed)
-    world, wires = texts(folder)
+    world, wires = texts(folder, yaml.safe_load(words.welding), analog=words.analog)
     wires = wires.replace(PLAYED_SCANS, str(folder / "scans"))
     order = folder / "cell.yaml"
     order.write_text(wires, encoding="utf-8")
@@ -108,7 +120,13 @@ def main() -> None:
         print("weldcal", *command[3:], flush=True)
         answer = subprocess.run([*command, "--overwrite"], check=False)
         print("exit code", answer.returncode)
-        print(json.dumps(played.truth(), indent=1))
+        truth = played.truth()
+    print(
+        json.dumps({key: truth[key] for key in truth if key not in ("torch_s_left_up_mm", "set_points_each")}, indent=1)
+    )
+    times = truth["torch_every_s"] * np.arange(len(truth.get("set_points_each", [])))
+    for k in range(0, len(times), 25):
+        print(f"{times[k]:7.2f} s", *truth["set_points_each"][k])
 
 
 if __name__ == "__main__":

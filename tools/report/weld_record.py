@@ -125,7 +125,7 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name, 2)}, and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -365,13 +365,13 @@ def _spread(seam: WeldedSeam, name: str) -> Spread:
     return seam.figures[name] if name in RANGES else seam.path_mm
 
 
-def _known(seam: WeldedSeam, name: str) -> str:
+def _known(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
     known = math.isfinite(_spread(seam, name).mean)
-    return f"{_range(seam, name)} {_WORDS[name][1]}" if known else "not known"
+    return f"{_range(seam, name, more_digits)} {_WORDS[name][1]}" if known else "not known"
 
 
-def _range(seam: WeldedSeam, name: str) -> str:
-    value, digits = _spread(seam, name), _WORDS[name][2]
+def _range(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
+    value, digits = _spread(seam, name), _WORDS[name][2] + more_digits
     return f"{fixed(value.least, digits)} to {fixed(value.most, digits)}"
 
 

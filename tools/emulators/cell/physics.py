@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.clearance import lowest_point, self_distance
+from weldcal.calibration.planning.clearance import TOOL, LinkCapsule, lowest_point, self_distance
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -102,6 +102,14 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
     return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).set_up_world)
 
 
+def to_the_wire(body: LinkCapsule, tool: WeldingTool | None) -> LinkCapsule:
+    """Return a body of the clearance checks; the torch's ends where the wire does, and its round end not beyond it."""
+    if tool is None or body.link != TOOL or np.linalg.norm(body.p_end - tool.X_FT @ tool.p_TW) > body.radius:
+        return body
+    way = body.p_end - body.p_start
+    return dc.replace(body, p_end=body.p_end - body.radius * way / np.linalg.norm(way))
+
+
 def still(station: Station, q: Array) -> tuple[Simulator, Context]:
     """A simulator of the station with the joint servos' reference at `q` (6,) rad and every other input at zero."""
     simulator = Simulator(station.diagram)
@@ -125,7 +133,7 @@ class Physics:
         self._table_z_m = scenario.table_height_m()
         self._joints = Repeatability(arm, repeatability_mm, seed)
         self._arm = arm
-        self._bodies = station_bodies(self.station)
+        self._bodies = [to_the_wire(body, self.station.tool) for body in station_bodies(self.station)]
         self._simulator, self._context = still(self.station, self.station.q_start)
         self._simulator.Initialize()
         diagram, plant = self.station.diagram, self.world.plant
@@ -146,6 +154,11 @@ class Physics:
         self.collisions = 0
         self._touches = False
 
+    @property
+    def samples(self) -> bool:
+        """Whether the newest frame is one of those whose torch is stored."""
+        return self._frame % LOG_EVERY == 0
+
     def step(self, q: Array, qd: Array, arc: Arc) -> None:
         """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc`: whether the arc burns."""
         self._frame += 1
@@ -157,7 +170,7 @@ class Physics:
             self.arc_on_s += STEP_S
             if not self._burns:
                 self.burns.append([])
-            if self._frame % LOG_EVERY == 0 and self._torch_port is not None:
+            if self.samples and self._torch_port is not None:
                 self.burns[-1].append(np.array(self._torch_port.Eval(self._context)))
         self._burns = arc.burns
         if self._frame % COLLISION_EVERY == 0:
@@ -273,6 +286,11 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
             "torch_max_mm": float(distance.max()),
             "torch_lateral_mean_mm": float(lateral.mean()),
             "torch_lateral_max_mm": float(lateral.max()),
+            "torch_every_s": LOG_EVERY * STEP_S,
+            "torch_s_left_up_mm": [
+                np.round(1e3 * np.column_stack([error.s, error.lateral, error.height]), 4).tolist()
+                for _, error in errors
+            ],
         }
         if len({numbers for numbers, _ in errors}) > 1:
             found["burns"] = [

@@ -143,6 +143,7 @@ class _World:
         self._programs = controller.script_count
         self._rests_s, self._dirty = 0.0, True
         self._given: dict[str, float] = {}
+        self._given_each: list[tuple[float, ...]] = []  # at the torch's samples
 
     def step(self, now: float) -> None:
         """One frame of the world, after the controller's."""
@@ -157,7 +158,7 @@ class _World:
         if c.script_count != self._programs:
             if not c.terminals.digital_outputs and c.program is not None and c.program.kind != "sec":
                 physics.forget()
-                self._given = {}
+                self._given, self._given_each = {}, []
             self._programs = c.script_count
         physics.step(c.arm.q, c.arm.qd, self._arc)
         if self._probe is not None and wires.touch_probe is not None:
@@ -165,6 +166,8 @@ class _World:
         if self._arc.burns and shares:
             points = wires.set_points
             self._given = {n: p.at_zero + shares[n] * (p.at_full - p.at_zero) for n, p in points.items()}
+            if physics.samples:
+                self._given_each.append(tuple(round(value, 3) for value in self._given.values()))
         self._expose()
         if self._scans is not None:
             self._scans.step(physics.time_s)
@@ -201,7 +204,8 @@ class _World:
         self._dirty = False
         rests = float(np.abs(self._controller.arm.qd).max()) < REST_RAD_S
         found = score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests)
-        found |= {"set_points": self._given} if self._wires.set_points else {}
+        if self._wires.set_points:
+            found |= {"set_points": self._given, "set_points_each": self._given_each}
         found |= {} if self._streamer is None else self._streamer.truth()
         if self._probe is not None:
             found["touch_probe"] = {"touches": self._probe.touches, "deepest_mm": 1e3 * self._probe.deepest_m}
