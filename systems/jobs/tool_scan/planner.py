@@ -152,7 +152,7 @@ def _ring_views(cell: _Cell, tool: WeldingTool, q: Array) -> list[ToolView]:
             tool.X_FR,
             cell.X_BC,
             cell.scanner,
-            _OF_EACH,
+            2 * _OF_EACH,
             q_start=cell.home,
             config=cell.limits,
             tool=tool.capsules(),
@@ -161,7 +161,7 @@ def _ring_views(cell: _Cell, tool: WeldingTool, q: Array) -> list[ToolView]:
         return []
     views: list[ToolView] = []
     for pose in poses:
-        if cell.clear(q, pose.q) and cell.clear(pose.q, cell.home):
+        if len(views) < _OF_EACH and cell.clear(q, pose.q) and cell.clear(pose.q, cell.home):
             views.append(ToolView(pose.q, np.asarray(pose.X_BF.inverse() @ cell.X_BC.translation())))
             q = pose.q
     return views

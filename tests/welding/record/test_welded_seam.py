@@ -218,7 +218,8 @@ def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -
     assert document["order"] == {"wps": "WPS-12", "part": "0711", "limits": {"speed_mm_s": [6.0, 11.0]}}
     assert document["seams"][0]["figures"]["speed_mm_s"]["least"] == pytest.approx(5.0, rel=0.01)
     assert re.fullmatch(
-        r"Seam 1: travel speed is 5\.0[0-4]\d to 10\.0[0-4]\d mm/s, and the limit is 6 to 11\.", *document["outside_limits"]
+        r"Seam 1: travel speed is 5\.0[0-4]\d to 10\.0[0-4]\d mm/s, and the limit is 6 to 11\.",
+        *document["outside_limits"],
     )
 
 
