@@ -65,7 +65,7 @@ def check_tool_scan(scenario: Scenario) -> None:
         raise InputError("A tool scan needs a welding tool: write tool: {file: my_tool.yaml} in the scenario.")
     if not config.result or not Path(config.result).exists():
         raise InputError(
-            f"tool_scan.result must be a result of weldcal calibrate, and there is none at '{config.result}'."
+            f"There is no result of weldcal calibrate at '{config.result}': correct --calibration, or tool_scan.result."
         )
     if not FEWEST <= config.scans <= MOST:
         raise InputError(f"tool_scan.scans must be from {FEWEST} to {MOST}, not {config.scans}.")
@@ -152,7 +152,7 @@ def _ring_views(cell: _Cell, tool: WeldingTool, q: Array) -> list[ToolView]:
             tool.X_FR,
             cell.X_BC,
             cell.scanner,
-            _OF_EACH,
+            2 * _OF_EACH,
             q_start=cell.home,
             config=cell.limits,
             tool=tool.capsules(),
@@ -161,7 +161,7 @@ def _ring_views(cell: _Cell, tool: WeldingTool, q: Array) -> list[ToolView]:
         return []
     views: list[ToolView] = []
     for pose in poses:
-        if cell.clear(q, pose.q) and cell.clear(pose.q, cell.home):
+        if len(views) < _OF_EACH and cell.clear(q, pose.q) and cell.clear(pose.q, cell.home):
             views.append(ToolView(pose.q, np.asarray(pose.X_BF.inverse() @ cell.X_BC.translation())))
             q = pose.q
     return views

@@ -29,8 +29,8 @@ from weldcal.systems.jobs.tool_scan.planner import FEWEST, MOST, ToolScanConfig,
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, WeldingConfig
-from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.commands.run import run_job
+from weldcal.tools.cli.options import LIVE, Call, Outcome, command, option
+from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.report.render import render, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
@@ -104,10 +104,7 @@ def tool_check(
 
 
 @command(
-    "tool measure",
-    options=("browser", "share"),
-    defaults={"browser": False},
-    short_help="Measure the torch by scans and touches.",
+    "tool measure", options=LIVE, defaults={"browser": False}, short_help="Measure the torch by scans and touches."
 )
 def tool_measure(
     call: Call,
@@ -120,9 +117,6 @@ def tool_measure(
     ] = None,
     touches: TouchesOption = None,
     scenario: CellOption = None,
-    robot: Annotated[
-        str, option("--robot", "NAME", "Without DATASET: simulated, emulated or a controller's address.")
-    ] = "simulated",
     scans: Annotated[
         int | None, option("--scans", "N", "Without DATASET: scans of the nozzle.", min=FEWEST, max=MOST)
     ] = None,
@@ -141,10 +135,7 @@ def tool_measure(
         if tool is not None:
             raise typer.BadParameter("--tool belongs to DATASET: the scenario names its tool")
         showing = showing_tool(scenario, calibration, scans)
-        options = RunOptions(
-            scenario=scenario, out=call.folder("tool-measure", scenario), seed=call.seed, robot=robot, **call.live
-        )
-        return run_tool_scan(showing, options, order, call.progress)
+        return run_tool_scan(showing, run_options(call, "tool-measure", scenario), order, call.progress)
     if calibration is None or tool is None:
         raise typer.BadParameter("scans need --calibration RESULT and --tool FILE")
     report = run_measurement(
