@@ -124,7 +124,8 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name, 2)}, and the limit is {_limit(self.order, name)}."
+            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name, 2)}, and the limit is"
+            f" {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
