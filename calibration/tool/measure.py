@@ -29,6 +29,7 @@ _BESIDE_M = 0.006  # a choice: of the tip's ball, beyond its radius
 _RING_M = 0.03  # a choice: where the ring is looked for
 _BALL_M = 2e-5  # a choice, per axis: what the outline's pixels do to a ball of some ten of them
 _PROFILE_M = 1e-3  # of the nozzle's wall, about its radius
+_MOUTH_M = 4e-4  # scans find the mouth to 0.25 mm (24 tools, `python -m tests.calibration.tool.torches --first 8000`)
 _FEWEST_DEG = 120.0  # a choice: of the circle about the nozzle
 
 
@@ -117,7 +118,7 @@ class ToolMeasurement:
 
     @property
     def p_FW(self) -> Array:
-        """The wire point (3,) m: touched, or on the nozzle's axis beside the file's."""
+        """The wire point (3,) m: touched, or on the nozzle's axis, beside the file's or as far from the mouth as there."""
         return self.p_FN if self.wire is None else self.wire.p_FW
 
     @property
@@ -196,8 +197,6 @@ def measure_tool(
         if wire.left_out:
             notes.append(f"Touch {wire.left_out[0]} contradicts the others and was left out.")
         moves.append(Move("wire", wire.p_FW - p_file, wire.covariance))
-    else:
-        notes.append("The wire was not touched: its end along the nozzle is that of the tool file.")
     ball = _ball(tool, scans, covariance, notes)
     if ball is not None:
         vague = ball.covariance + _BALL_M**2 * np.eye(3)
@@ -216,6 +215,13 @@ def measure_tool(
             )
         )
     stick_out, sigma = _stick_out(nozzle.surface, points, p_FN if wire is None else wire.p_FW)
+    if wire is None:
+        of_file = tool.tool.stick_out_m
+        if of_file is not None and abs(of_file - stick_out) > _MOUTH_M:
+            p_FN, stick_out = p_FN + (of_file - stick_out) * a, of_file
+            notes.append(f"The wire was not touched: its end is {1e3 * of_file:.1f} mm from the measured mouth.")
+        else:
+            notes.append("The wire was not touched: its end along the nozzle is that of the tool file.")
     return ToolMeasurement(
         tool=tool,
         nozzle=nozzle,

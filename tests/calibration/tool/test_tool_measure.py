@@ -49,6 +49,15 @@ def test_the_axis_region_is_neither_wide_nor_narrow() -> None:
     assert 0.75 < np.mean([r.axis_chi2 for r in several()]) < 5.0
 
 
+def test_an_untouched_wire_keeps_its_place_or_its_stick_out() -> None:
+    """The tool file has the torch 1.5 mm too long; then the mouth is where it should be."""
+    c, right = cell(43, Wrong()), load_tool(WELDING)
+    for tool in (right, replace(right, p_FW=right.p_FW + [0.0, 0.0, 1.5e-3])):
+        got = measure_tool(tool, c.scans, c.covariance)
+        assert abs((got.p_FW - c.truth.p_FW) @ c.truth.axis) < 0.4e-3
+        assert ("from the measured mouth" in got.notes[-1]) == (tool is not right)
+
+
 def truth(rng: np.random.Generator) -> Truth:
     axis = UP + 0.03 * np.append(rng.normal(size=2), 0.0)
     return Truth(torches.NOMINAL + 0.003 * unit(rng), axis / np.linalg.norm(axis), torches.BALL, 0.012)
