@@ -148,13 +148,14 @@ SHARES = {
     "approach": 0.36,
     "weld": 0.38,
     "retract": 0.96,
-    "interpass": 0.34,
-    "plan_pass": 0.34,
-    "plan_seam": 0.34,
+    "interpass": 0.97,
+    "plan_pass": 0.97,
+    "plan_seam": 0.97,
     "home": 0.97,
     "done": 0.98,
     "held": 0.98,
 }
+BETWEEN_WELDS = ("interpass", "plan_pass", "plan_seam")
 
 
 @dataclass(eq=False, kw_only=True)
@@ -228,7 +229,8 @@ class WeldJob(AddedJob):
             share += 0.58 * along / planned.length
             detail = ", ".join(filter(None, (detail, f"{1e3 * along:.0f} of {1e3 * planned.length:.0f} mm")))
         if welds > 1 and share > SHARES["park"]:
-            share = SHARES["park"] + (1.0 - SHARES["park"]) * (weld + share) / welds
+            part = SHARES["approach_above"] if phase in BETWEEN_WELDS else share  # that counts the next weld already
+            share = SHARES["park"] + (1.0 - SHARES["park"]) * (weld + part) / welds
         return phase_words(phase, detail), share
 
 
