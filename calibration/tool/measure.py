@@ -118,7 +118,7 @@ class ToolMeasurement:
 
     @property
     def p_FW(self) -> Array:
-        """The wire point (3,) m: touched, or on the nozzle's axis, beside the file's or as far from the mouth as there."""
+        """The wire point (3,) m: touched, or on the nozzle's axis, by the file's place or by its stick-out."""
         return self.p_FN if self.wire is None else self.wire.p_FW
 
     @property

@@ -52,7 +52,7 @@ def test_the_axis_region_is_neither_wide_nor_narrow() -> None:
 def test_an_untouched_wire_keeps_its_place_or_its_stick_out() -> None:
     """The tool file has the torch 1.5 mm too long; then the mouth is where it should be."""
     c, right = cell(43, Wrong()), load_tool(WELDING)
-    for tool in (right, replace(right, p_FW=right.p_FW + [0.0, 0.0, 1.5e-3])):
+    for tool in (right, replace(right, p_FW=right.p_FW + 1.5e-3 * UP)):
         got = measure_tool(tool, c.scans, c.covariance)
         assert abs((got.p_FW - c.truth.p_FW) @ c.truth.axis) < 0.4e-3
         assert ("from the measured mouth" in got.notes[-1]) == (tool is not right)
