@@ -19,9 +19,10 @@ import typer.main
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.cli.app import PANELS, app
+from weldcal.tools.cli.app import MOVED, PANELS, app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
@@ -383,3 +384,12 @@ def test_results_become_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
         "ids": ["a", "b"],
         "nothing": None,
     }
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_a_study_that_is_a_test_now_says_how_it_is_run(name: str) -> None:
+    found = CliRunner().invoke(app, ["dev", "benchmark", name])
+    assert found.exit_code == 2
+    assert MOVED[name] in " ".join(found.output.split())
+    *_, place = MOVED[name].split()
+    assert (ROOT / (place if "/" in place else place.replace(".", "/") + ".py")).exists()

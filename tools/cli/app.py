@@ -51,6 +51,17 @@ ORDER = (
 """The full names of the commands in the order of the help text; the others follow by name."""
 
 
+MOVED = {
+    "fuzz-files": "python -m tests.fuzz.run",
+    "flange-halves": "pytest tests/tools/studies/test_flange_halves.py",
+    "flange-holes": "pytest tests/calibration/flange/test_filled_holes.py",
+    "flange-parts": "pytest tests/calibration/flange",
+    "flange-start": "pytest tests/calibration/eye_on_base/test_arm_start.py",
+    "hand-eye-conventions": "pytest tests/calibration/hand_eye/test_written_sets.py",
+}
+"""Studies that are tests now, each with the command that runs it."""
+
+
 class LazyCommands(MutableMapping[str, Any]):
     """The commands of a group by name: sub-groups as they are, a command imported when it is asked for."""
 
@@ -112,6 +123,8 @@ class CommandGroup(TyperGroup):
 
             entries = self.commands.entries  # type: ignore[attr-defined]
             shown = [name for name in self.commands if name not in entries or not entries[name].hidden]
+            if args[0] in MOVED:
+                ctx.fail(f"'{args[0]}' is no command of version 1.0: in a checkout run {MOVED[args[0]]}.")
             near = nearest(args[0], shown)
             ctx.fail(f"No such command '{args[0]}'." + (f" Did you mean '{near}'?" if near else ""))
         return super().resolve_command(ctx, args)
