@@ -90,6 +90,8 @@ class CommandLine:
     @property
     def elsewhere(self) -> str:
         """By what else it is executed; empty: by a check of the pages."""
+        if self.begins("tool measure") and "--scenario" in self.words:
+            return "the test of the tool scan, whose calibration is that of its cell"
         return "the tests of a Dask cluster" if "--scheduler" in self.words else ELSEWHERE.get(self.words[0], "")
 
     @property

@@ -150,6 +150,7 @@ def _torch(name: str) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         with TemporaryDirectory() as folder:
             torches.written(torches.cell(11, torches.Wrong(bend=2e-4), scans=8), Path(folder))
+            path.parent.mkdir(exist_ok=True)
             shutil.move(Path(folder) / name, path)
 
     return write
@@ -226,7 +227,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "touches.csv": lambda path: write_visit(path.parent),
     "touched_points.csv": lambda path: path.write_text(touches_text(touch_world(20).touches), encoding="utf-8"),
     "touched-calibration": lambda path: save_result(touch_world(20).result, path),
-    "torch_scans": _torch("scans"),
+    "shown/scans": _torch("scans"),
     "torch_result": _torch("result"),
     "wire_touches.csv": _torch("touches.csv"),
     "edge.npz": _profiler("edge"),

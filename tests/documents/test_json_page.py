@@ -33,7 +33,7 @@ OTHERS = {
     "print-board": "print-board",
     "doctor": "doctor three_scans",
     "tool measure": (
-        "tool measure torch_scans --calibration torch_result --tool my_tool.yaml --touches wire_touches.csv"
+        "tool measure shown/scans --calibration torch_result --tool my_tool.yaml --touches wire_touches.csv"
     ),
     "profiler edge": "profiler edge edge.npz",
     "profiler seam": "profiler seam groove.npz --calibration my-profiler",
