@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     )
     from weldcal.systems.drivers.station_build import PreparedRobot as PreparedRobot, StationBuild as StationBuild
     from weldcal.systems.jobs.job import AddedJob as AddedJob, Job as Job
+    from weldcal.systems.jobs.motion.procedure import (
+        MotionCalibration as MotionCalibration,
+        MotionRecord as MotionRecord,
+        MotionState as MotionState,
+    )
+    from weldcal.systems.jobs.mounting.procedure import MountingState as MountingState, MountingStatus as MountingStatus
     from weldcal.systems.jobs.procedure import Procedure as Procedure, ProcedureState as ProcedureState
+    from weldcal.systems.jobs.profiler.procedure import ProfilerState as ProfilerState
+    from weldcal.systems.jobs.tablet.config import TabletTouch as TabletTouch, WristPicture as WristPicture
+    from weldcal.systems.jobs.tablet.procedure import TabletState as TabletState
     from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
         ArucoDeformationEstimator as ArucoDeformationEstimator,
         Deformation as Deformation,
@@ -50,10 +59,15 @@ if TYPE_CHECKING:
         Message as Message,
         PlannedSeam as PlannedSeam,
         ProfileScan as ProfileScan,
+        Refinement as Refinement,
         Scan as Scan,
         ScanStream as ScanStream,
+        ScanView as ScanView,
+        SeamRecord as SeamRecord,
+        StreamedScan as StreamedScan,
         TorchTouch as TorchTouch,
         UrStatus as UrStatus,
+        VerificationResult as VerificationResult,
     )
     from weldcal.systems.motion.buffers import (
         FrameQueue as FrameQueue,
@@ -80,7 +94,7 @@ if TYPE_CHECKING:
     from weldcal.systems.runner import Run as Run, run_cell as run_cell
     from weldcal.systems.scenario.loading import load_scenario as load_scenario
     from weldcal.systems.scenario.schema import Scenario as Scenario
-    from weldcal.systems.station import Station as Station
+    from weldcal.systems.station import Station as Station, Truth as Truth
     from weldcal.systems.wiring import Replacement as Replacement, Wiring as Wiring
 else:
     from weldcal.models import exported

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
         PartNotFound as PartNotFound,
         PartRegistration as PartRegistration,
     )
+    from weldcal.welding.passes.angles import AnglesAlong as AnglesAlong
     from weldcal.welding.passes.bead import bead_area as bead_area, propose_passes as propose_passes
     from weldcal.welding.passes.felt import PassError as PassError, WeldPass as WeldPass
+    from weldcal.welding.record.schedule import GapAlong as GapAlong
     from weldcal.welding.record.weld_log import WeldRecord as WeldRecord, load_weld_log as load_weld_log
     from weldcal.welding.seam.curve import SeamCurve as SeamCurve, SeamError as SeamError
     from weldcal.welding.seam.feasibility import (
@@ -32,9 +34,11 @@ if TYPE_CHECKING:
         assess_seam as assess_seam,
         split_seam as split_seam,
     )
+    from weldcal.welding.servo.interruption import Interruption as Interruption
     from weldcal.welding.servo.settings import ServoConfig as ServoConfig
     from weldcal.welding.servo.state import (
         DeflectionSample as DeflectionSample,
+        Diagnostics as Diagnostics,
         Phase as Phase,
         ServoSample as ServoSample,
         WeldingCommand as WeldingCommand,

@@ -87,6 +87,10 @@ class ScannerConfig(DriverConfig, ABC):
         """
         return None
 
+    def put_at_nominal(self) -> tuple[list[float], list[float]] | None:
+        """Put a simulated scanner exactly at its nominal pose; return xyz (m) and rpy (deg). None for a real one."""
+        return None
+
 
 class FingerCameraConfig(DriverConfig, ABC):
     """Base class of all finger camera configurations."""

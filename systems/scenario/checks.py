@@ -429,4 +429,9 @@ def check_scenario(scenario: Scenario) -> None:
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
     if scenario.job.weld and not scenario.job.calibrate and (scenario.job.X_BC or scenario.carried_scanner()) is None:
-        raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")
+        nominal = scenario.calibration.mounting_guess
+        raise InputError(
+            "A weld without calibrating first needs the known pose of the scanner in the base. Write, with the numbers"
+            f" of your calibration: job: {{calibrate: false, X_BC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
+            f" {nominal.rpy_deg}}}}}"
+        )

@@ -19,7 +19,7 @@ from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.job import jobs
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
 
 
 def check_keys(schema: type, document: Any, place: str = "") -> None:
@@ -91,8 +91,17 @@ def scenario_class() -> type[Scenario]:
     return dc.make_dataclass("Scenario", fields, bases=(Scenario,))
 
 
+def use_nominal_scanner(scenario: Scenario) -> None:
+    """Put a simulated scanner exactly at its nominal pose, and state this pose as the known one."""
+    scanner = scenario.scanner_config()
+    if scanner is not None and scanner.mounted_on in ("base", "flange") and (pose := scanner.put_at_nominal()):
+        setattr(scenario.job, "X_FC" if scanner.mounted_on == "flange" else "X_BC", PoseConfig(*pose))
+
+
 def load_scenario(name: str, overrides: str = "") -> Scenario:
     """Load a scenario by name or path; `overrides` is a second YAML text merged over it.
+
+    A weld without a calibration and without a known pose takes the nominal pose of a simulated scanner.
 
     Raises:
         InputError: unknown name, unknown key, wrong type; the message says which.
@@ -103,6 +112,8 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         resolve_files(scenario, _path_of(name).parent)
     _use_width_of_scanner_file(scenario)
     _use_camera_of(scenario)
+    if (job := scenario.job).weld and not (job.calibrate or job.X_BC or job.X_FC):
+        use_nominal_scanner(scenario)
     check_scenario(scenario)
     return scenario
 

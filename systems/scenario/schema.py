@@ -342,7 +342,8 @@ class JobConfig:
 
     calibrate: bool = True
     weld: bool = True
-    X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
+    # a known calibration, where `calibrate` is off; null: a simulated scanner is then exactly at its nominal pose
+    X_BC: PoseConfig | None = None
     X_FC: PoseConfig | None = None  # the same of a scanner on the flange: its pose in the flange's frame
     # its expected error at the work point, one sigma; null: that of an arm as its maker leaves it
     X_BC_sigma_mm: float | None = None

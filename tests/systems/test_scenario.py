@@ -15,6 +15,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.checks import check_numbers, check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
@@ -490,7 +491,6 @@ def test_a_mistake_is_answered_with_one_sentence_that_names_it(overrides: str, n
         ("workpiece: null", "A weld needs a workpiece"),
         ("finger_camera: !NoDevice {}", "and a finger_camera"),
         ("tool: none\ncalibration: {feature: flange}", "A weld needs .* tool: welding"),
-        ("job: {calibrate: false}", "without calibrating first needs job.X_BC"),
         ("robot: !NoDevice {}", "A cell needs a robot"),
         ("scanner: !NoDevice {}", "This job needs a scanner"),
         ("scanner: !NoDevice {}\njob: {calibrate: false, X_BC: {xyz_m: [0.0, 0.0, 1.0]}}", "This job needs a scanner"),
@@ -499,6 +499,38 @@ def test_a_mistake_is_answered_with_one_sentence_that_names_it(overrides: str, n
 def test_two_settings_that_contradict_each_other_are_refused(overrides: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", overrides)
+
+
+ALONE = "job: {calibrate: false, X_FC: null}\n"
+SCANNERS = pytest.mark.parametrize(("name", "key"), [("s_groove", "X_BC"), ("carried_scanner", "X_FC")])
+
+
+@SCANNERS
+def test_a_weld_alone_takes_a_simulated_scanners_nominal_pose(name: str, key: str) -> None:
+    scenario = load_scenario(name, ALONE)
+    scanner = scenario.scanner
+    assert isinstance(scanner, RenderedScanner)
+    assert getattr(scenario.job, key) == PoseConfig(scanner.xyz_m, scanner.rpy_deg)
+    assert scanner.mounting_translation_mm == scanner.mounting_rotation_deg == 0.0
+
+
+def test_a_stated_pose_leaves_the_simulated_scanner_where_it_is() -> None:
+    scenario = load_scenario("s_groove", "job: {calibrate: false, X_BC: {xyz_m: [0.1, 0.2, 0.3]}}")
+    assert scenario.job.X_BC is not None
+    assert scenario.job.X_BC.xyz_m == [0.1, 0.2, 0.3]
+    assert isinstance(scenario.scanner, RenderedScanner)
+    assert scenario.scanner.mounting_translation_mm == 15.0
+
+
+@SCANNERS
+def test_a_real_scanner_without_a_pose_gets_a_line_to_paste(name: str, key: str) -> None:
+    carried = "mounted_on: flange" if key == "X_FC" else "mounted_on: base"
+    real = f"scanner: !FolderScanner {{folder: scans, {carried}}}\n"
+    with pytest.raises(InputError) as refused:
+        load_scenario(name, real + ALONE)
+    line = str(refused.value)[str(refused.value).index("job: {") :]
+    scenario = load_scenario(name, real + line)
+    assert getattr(scenario.job, key) == scenario.calibration.mounting_guess
 
 
 @pytest.mark.parametrize(

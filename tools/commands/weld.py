@@ -20,7 +20,6 @@ from weldcal.calibration.eye_on_base.stated_error import observed_document, orie
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result
 from weldcal.systems.cell import Cell
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.progress_keeper import RESTART, ProgressKeeper, sha256_of
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanner
@@ -30,8 +29,8 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.recording.scenario_files import SCENARIO, packed
 from weldcal.systems.runner import Progress, Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import PoseConfig, Scenario
+from weldcal.systems.scenario.loading import load_scenario, use_nominal_scanner
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
@@ -191,13 +190,7 @@ def known_camera(name: str) -> Scenario:
     """
     scenario = load_scenario(name)
     scenario.job.calibrate, scenario.job.weld = False, True
-    if isinstance(scenario.scanner, RenderedScanner):
-        scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
-        pose = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
-        if scenario.scanner.mounted_on == "flange":
-            scenario.job.X_FC = pose
-        else:
-            scenario.job.X_BC = pose
+    use_nominal_scanner(scenario)
     check_scenario(scenario)
     return scenario
 

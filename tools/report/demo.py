@@ -9,6 +9,7 @@ import numpy as np
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import Part
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.seam_planning import UNFELT
@@ -116,9 +117,13 @@ class DemoResult:
                 concerns=self.warnings,
                 notes=self.arm_note,
             )
-            more["pose"] = (
-                "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
-            )
+            more["pose"] = "none was found" if scenario.job.calibrate else "none was computed: X_BC is the scenario's"
+            scanner = scenario.scanner
+            if (
+                isinstance(scanner, RenderedScanner)
+                and not scanner.mounting_translation_mm + scanner.mounting_rotation_deg
+            ):
+                more["pose"] = "none was computed: the simulated scanner is exactly at its nominal pose"
             none = ExpectedError("error at the work point, 95 %", "not known", "there is no calibration")
             return FirstScreen(
                 found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()

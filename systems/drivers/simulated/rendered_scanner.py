@@ -69,6 +69,11 @@ class RenderedScanner(ScannerConfig):
         p = X_BC.translation()
         return RigidTransform(R, p + 1e-3 * np.array(self.knock_mm) - R @ p)
 
+    def put_at_nominal(self) -> tuple[list[float], list[float]]:
+        """See ScannerConfig."""
+        self.mounting_translation_mm = self.mounting_rotation_deg = 0.0
+        return list(self.xyz_m), list(self.rpy_deg)
+
     def scanner(self) -> ScannerPreset:
         """The scanner with the configured resolution and field of view; the pixels' aspect ratio is unchanged."""
         return get_scanner(self.preset, self.width, self.height, self.field_of_view_deg)

@@ -318,9 +318,11 @@ def check_scan_poses(scenario: Scenario) -> None:
             " arm has one view: remove the list, or let the arm carry the scanner."
         )
     if on_flange and job.weld and (job.calibrate or job.X_FC is None):
+        nominal = scenario.calibration.mounting_guess
         raise InputError(
             "A weld with the scanner on the flange needs its pose there: calibrate with the scenario eye_in_hand first,"
-            " then write job.calibrate: false and job.X_FC."
+            f" then write its numbers into job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
+            f" {nominal.rpy_deg}}}}}"
         )
     if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
         raise InputError(
