@@ -1,4 +1,4 @@
-"""Drive a scanner: the configuration, a system that takes a scan when the job asks, and the function that adds it."""
+"""Drive a scanner: its configuration, a system that scans, and what adds the system."""
 
 import dataclasses as dc
 from typing import Any, cast
@@ -32,7 +32,8 @@ class MySensor(LeafSystem):
         self._trigger: Any = self.DeclareVectorInputPort("trigger", 1)
         self._time: Any = self.DeclareVectorInputPort("sample_time", 1)
         # Drake's stubs do not type what an abstract port carries, hence `cast`.
-        self._X_BF: Any = self.DeclareAbstractInputPort("X_BF", cast(Any, AbstractValue).Make(RigidTransform()))
+        pose_type: Any = cast(Any, AbstractValue).Make(RigidTransform())
+        self._X_BF: Any = self.DeclareAbstractInputPort("X_BF", pose_type)
         self._newest = self.DeclareAbstractState(cast(Any, AbstractValue).Make(Scan()))
         self.DeclareStateOutputPort("scan", self._newest)
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.02, 0.0, self._update)
@@ -42,13 +43,13 @@ class MySensor(LeafSystem):
         if number > context.get_abstract_state(self._newest).get_value().sequence:
             X_CF = self._X_BC.inverse() @ self._X_BF.Eval(context)
             points_C = scan(X_CF, np.random.default_rng(number))  # ask your device here
-            capture_time = float(self._time.Eval(context)[0])
-            newest = Scan(sequence=number, capture_time=capture_time, points_C=points_C.astype(np.float32))
+            time = float(self._time.Eval(context)[0])
+            newest = Scan(number, time, points_C.astype(np.float32))
             state.get_mutable_abstract_state(self._newest).set_value(newest)
 
 
 def ApplyDriverConfig(config: MyScanner, build: StationBuild) -> RigidTransform:
-    """Add the sensor, connect it to the arm, and name its ports; return X_BC where it is known."""
+    """Add the sensor, connect it, and name its ports; return X_BC where it is known."""
     X_BC = pose(np.pi, 0.0, -np.pi / 2, config.xyz_m)
     sensor = build.builder.AddNamedSystem("my_scanner", MySensor(X_BC))
     for name in ("X_BF", "sample_time"):

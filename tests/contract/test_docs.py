@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
+from markdown_it import MarkdownIt
 
+from tests.documents.blocks import all_blocks
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.tools.cli.app import app
@@ -21,6 +23,9 @@ from weldcal.tools.cli.app import app
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LONGEST_README = 90
+WIDEST_CODE = (
+    88  # characters of a column of the site in a window of 1280 pixels; tests/documents/test_site.py measures it
+)
 FOLDERS = ("models", "calibration", "welding", "systems", "tools", "tests")
 
 FENCED = re.compile(r"^```([a-z]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -37,7 +42,8 @@ def blocks(document: Path, language: str | None = None) -> list[str]:
 
 def typed_lines(document: Path) -> list[str]:
     """The lines of the document's code blocks that run weldcal."""
-    lines = (line.strip().removeprefix("$ ") for block in blocks(document) for line in block.splitlines())
+    joined = (re.sub(r" *\\\n\s*", " ", block) for block in blocks(document))
+    lines = (line.strip().removeprefix("$ ") for block in joined for line in block.splitlines())
     return [line for line in lines if line.startswith(("./tools/run", "weldcal "))]
 
 
@@ -229,6 +235,42 @@ def test_the_dataset_that_the_documents_show_can_be_loaded(tmp_path: Path) -> No
 def test_links_lead_somewhere(document: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text()):
         assert (document.parent / target).exists(), f"{document.name} links to {target}, which is not there"
+
+
+def rows_outside_a_table(text: str) -> list[str]:
+    """The rows of pipes that a reader of Markdown does not take for a table, such as those below an empty line."""
+    tokens = MarkdownIt("commonmark").enable("table").parse(text)
+    spans = [t.map for t in tokens if t.map and t.type in ("table_open", "fence", "code_block", "html_block")]
+    inside = {line for start, end in spans for line in range(start, end)}
+    return [line for k, line in enumerate(text.splitlines()) if line.lstrip().startswith("|") and k not in inside]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_each_row_of_pipes_is_in_a_table(document: Path) -> None:
+    assert rows_outside_a_table(document.read_text()) == []
+
+
+def test_a_table_that_an_empty_line_breaks_is_found() -> None:
+    whole = "# A page\n\n| a | b |\n|---|---|\n| 1 | 2 |\n"
+    assert rows_outside_a_table(whole) == []
+    assert rows_outside_a_table(whole + "\n| 3 | 4 |\n") == ["| 3 | 4 |"]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_a_block_of_code_fits_its_column(document: Path) -> None:
+    tokens = MarkdownIt("commonmark").parse(re.sub(r"\A---\n.*?^---\n", "", document.read_text(), flags=re.M | re.S))
+    code = [token.content for token in tokens if token.type in ("fence", "code_block")]
+    shown = [
+        (document.parent / name).read_text() for name in re.findall(r"{literalinclude} (\S+)", document.read_text())
+    ]
+    lines = [line for block in (*code, *shown) for line in block.splitlines()]
+    assert [line for line in lines if len(line) > WIDEST_CODE] == []
+
+
+def test_a_block_of_commands_is_read_as_shell() -> None:
+    shell = [block for block in all_blocks() if block.kind == "shell"]
+    assert len(shell) > 50
+    assert [f"{block.page}:{block.line}" for block in shell if block.language not in ("sh", "console")] == []
 
 
 def test_no_file_names_a_machine_or_a_mirror() -> None:

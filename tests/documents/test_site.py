@@ -61,6 +61,15 @@ def test_a_search_without_a_network_finds_the_page_that_explains_a_word(site: Pa
     assert [name for name in browser.outside_addresses() if not name.startswith("file:")] == []
 
 
+def test_no_block_of_code_is_wider_than_its_column(site: Path, browser: Browser) -> None:
+    wide = "return [...document.querySelectorAll('pre')].filter(e => e.scrollWidth > e.clientWidth).map(e => e.textContent)"
+    cut = {}
+    for page in PAGES:
+        browser.open(site / f"{page}.html")
+        cut[page] = browser.run(wide)
+    assert {page: blocks for page, blocks in cut.items() if blocks} == {}
+
+
 def test_a_page_fits_a_phone(site: Path, browser: Browser, tmp_path: Path) -> None:
     browser.resize(390, 844)
     try:

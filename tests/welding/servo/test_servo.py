@@ -44,7 +44,7 @@ MM = 1e-3
 
 @lru_cache(maxsize=8)
 def nominal(name: str) -> tuple[Run, PathError, SpeedStatistics]:
-    """A weld within the nominal error budget of weld_law.md, B.3, and how well it went."""
+    """A weld within the nominal error budget, and how well it went."""
     points = {"straight": straight(), "s": s_curve(), "l": l_curve()}[name]
     return judged(weld(points, NOMINAL, CALIBRATED, seed={"straight": 1, "s": 2, "l": 3}[name]), points)
 

@@ -144,7 +144,7 @@ PERFECT = Budget(
 )
 KINEMATIC = replace(PERFECT, name="kinematic", lag_s=0.020, tag_sigma_m=0.02e-3)
 
-# docs/weld_law.md, section 9, says where each size comes from.
+# docs/weld_law.md, section 8, says where each size comes from.
 _WALL = math.radians(0.75)
 _STAMPS = Unknowns(
     image_bias_s=(-0.010, 0.010), image_jitter_s=(0.002, 0.002), pose_bias_s=(0.0, 0.008), pose_jitter_s=(0.002, 0.002)
