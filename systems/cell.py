@@ -38,8 +38,8 @@ class Cell(Generic[JobOf]):
     The caller that builds a cell must close its station.
 
     `diagram` exports the station's output ports under their names, those of the job that JobPorts lists under theirs,
-    and `job` (JobCommand), `state` and `process_on` (1). `logs`: the sinks of the logged values by name; in the Diagram
-    the sink of NAME is called `log_NAME`.
+    and `job` (JobCommand), `state` and `process_on` (1); docs/reference/python_functions.md says what each vector holds.
+    `logs`: the sinks of the logged values by name; in the Diagram the sink of NAME is called `log_NAME`.
     """
 
     diagram: Diagram
@@ -51,7 +51,10 @@ class Cell(Generic[JobOf]):
 
     @property
     def ports(self) -> dict[str, str]:
-        """The diagram's output ports by name: the class of the values, or how many numbers a vector has."""
+        """The diagram's output ports by name: the class of the values, or how many numbers a vector has.
+
+        What the numbers mean: docs/reference/python_functions.md, "Ports of a cell".
+        """
         found = {}
         for k in range(self.diagram.num_output_ports()):
             port = self.diagram.get_output_port(k)

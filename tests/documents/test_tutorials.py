@@ -138,6 +138,13 @@ def test_the_arm_goes_where_the_users_systems_send_it(executed: Executed) -> Non
     assert reached == pytest.approx([170, -75, 115, -45, 95, 10], abs=0.1)
 
 
+def test_the_filter_smooths_what_the_servo_gets(executed: Executed) -> None:
+    _, printed = executed("a_filter")
+    assert "done None" in printed
+    raw, filtered = (numbers(re.findall(rf"{name} (.*) um", printed)[0])[0] for name in ("raw", "filtered"))
+    assert 0.0 < filtered < 0.5 * raw
+
+
 def test_the_part_has_the_seam_that_the_text_names(executed: Executed) -> None:
     folder, printed = executed("your_own_part")
     rows = {row["id"]: row for row in csv.DictReader((folder / "my_part" / "edges.csv").open())}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import closing
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -12,15 +14,21 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder
 from pydrake.systems.framework import LeafSystem as DrakeSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, scenario
+import weldcal.systems
+import weldcal.welding
+from tests.places import ROOT
+from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, scenario, weld_only_cell
 from weldcal.models.errors import InputError
+from weldcal.systems.cell import build_cell
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.own_diagram import AddCell, AddStation
 from weldcal.systems.runner import run_cell
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.state import Phase
+from weldcal.welding.servo.state import Phase, WeldingCommand
 
 SPEED = 0.1  # rad/s
 
@@ -96,6 +104,38 @@ def test_a_job_in_a_users_diagram_calls_the_users_servo() -> None:
     began = next(at for name, at, _ in run.phases if name == "weld")
     z = np.interp([began, began + 0.6], log.sample_times(), log.data()[2])
     assert z[1] - z[0] == pytest.approx(0.02 * 0.5, rel=0.2)
+
+
+def ports_on_the_page() -> dict[str, str]:
+    """What the table of docs/reference/python_functions.md says of each port of a weld."""
+    page = (ROOT / "docs" / "reference" / "python_functions.md").read_text()
+    table = page.partition("## Ports of a cell")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?`) \| (.*?)(?::.*)? \|$", table, re.MULTILINE)
+    return {name: kind for names, kind in rows for name in re.findall(r"`([\w.]+)`", names)}
+
+
+def test_the_page_says_what_each_port_of_a_weld_holds() -> None:
+    assert ports_on_the_page() == weld_only_cell().ports
+
+
+@pytest.mark.parametrize("name", ["", "motion", "tablet", "profiler_edge", "eye_in_hand"])
+def test_the_type_of_every_port_is_a_public_name(name: str) -> None:
+    cell = build_cell(load_scenario(name)) if name else weld_only_cell()
+    try:
+        kinds = {kind for kind in cell.ports.values() if not kind.startswith("vector of ")}
+    finally:
+        if name:
+            cell.station.close()
+    assert len(kinds) > 5
+    assert kinds - {"QueryObject", "RigidTransform"} - set(weldcal.systems.__all__) == set()
+
+
+@pytest.mark.parametrize("message", [Deformation, ServoReport, WeldingCommand])
+def test_the_parts_of_a_message_of_the_weld_are_public_names(message: type) -> None:
+    kinds = [kind for hint in get_type_hints(message).values() for kind in (hint, *get_args(hint))]
+    own = {kind.__name__ for kind in kinds if getattr(kind, "__module__", "").startswith("weldcal.")}
+    assert own
+    assert own - {*weldcal.systems.__all__, *weldcal.welding.__all__} == set()
 
 
 def test_planners_and_estimators_are_replaced_by_name() -> None:
