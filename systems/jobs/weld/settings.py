@@ -320,8 +320,8 @@ def check_scan_poses(scenario: Scenario) -> None:
     if on_flange and job.weld and (job.calibrate or job.X_FC is None):
         nominal = scenario.calibration.mounting_guess
         raise InputError(
-            "A weld with the scanner on the flange needs its pose there: calibrate with the scenario eye_in_hand first,"
-            f" then write its numbers into job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
+            "A weld with the scanner on the flange needs its pose there. Calibrate with the scenario eye_in_hand first."
+            f" Then write, with its numbers: job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
             f" {nominal.rpy_deg}}}}}"
         )
     if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
