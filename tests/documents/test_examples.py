@@ -23,7 +23,10 @@ from tests.documents.yaml_blocks import check_yaml
 from tests.places import ROOT, SHARED_DATA, needs
 from tests.short_job import ShortJobs
 from weldcal.models.errors import InputError
+from weldcal.systems.cell import build_cell
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
+from weldcal.welding.servo.weave import WeaveError
 
 BLOCKS = all_blocks()
 LINES = [
@@ -111,6 +114,18 @@ def test_the_diagram_of_ones_own_runs(tmp_path: Path) -> None:
     (block,) = [block for block in blocks_of(ROOT / "docs/developers.md") if block.kind == "python"]
     (done,) = Page(tmp_path, "").execute(block)
     assert done.how == WRITTEN, done.said
+
+
+@pytest.mark.parametrize("block", [b for b in SNIPPETS if b.page == "docs/weld_orders.md"], ids=named)
+def test_each_order_of_the_page_is_one_that_a_cell_can_keep(block: Block) -> None:
+    cell = build_cell(load_scenario("s_groove", f"job: {{calibrate: false}}\n{block.text}"))
+    cell.station.close()
+
+
+def test_an_order_that_no_cell_can_keep_would_be_caught() -> None:
+    too_fast = "job: {calibrate: false}\nwelding: {weave: {shape: triangle, frequency_hz: 1.5}}"
+    with pytest.raises(WeaveError, match="set frequency_hz to"):
+        build_cell(load_scenario("s_groove", too_fast))
 
 
 def test_the_examples_of_a_weld_log_run_on_the_log_of_a_demo(short_jobs: ShortJobs, tmp_path: Path) -> None:
