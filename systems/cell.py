@@ -38,7 +38,7 @@ class Cell(Generic[JobOf]):
     The caller that builds a cell must close its station.
 
     `diagram` exports the station's output ports under their names, those of the job that JobPorts lists under theirs,
-    and `job` (JobCommand), `state` and `process_on` (1); docs/reference/python_functions.md says what each vector holds.
+    and `job` (JobCommand), `state` and `process_on` (1). What each vector holds: docs/reference/python_functions.md.
     `logs`: the sinks of the logged values by name; in the Diagram the sink of NAME is called `log_NAME`.
     """
 
