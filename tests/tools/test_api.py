@@ -60,7 +60,7 @@ def test_poses_of_another_shape_are_refused_in_a_sentence(shape: tuple[int, ...]
 def test_an_example_is_not_written_over_something(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty: choose another folder"):
-        write_example(tmp_path, 0)
+        write_example(tmp_path)
 
 
 def test_a_cell_shows_its_plant_its_viewer_and_its_named_logs() -> None:
