@@ -127,6 +127,9 @@ class OwnProcess:
     _preparing: "list[Future[Any]]" = field(default_factory=list)
     _newest: "tuple[Future[Any], float] | None" = None  # the newest question, and when it was asked
 
+    def __post_init__(self) -> None:
+        require_guard()
+
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """See Background."""
         with deferred():  # the first one starts the process

@@ -29,7 +29,9 @@ def executed(line: str, folder: Path, *more: str) -> subprocess.CompletedProcess
     assert words[0] == "weldcal"
     command = [sys.executable, "-P", "-m", "weldcal.tools", *words[1:], *more]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,5 +100,3 @@ def test_the_example_is_small_and_written_for_a_reader(tmp_path: Path) -> None:
     assert len(list((folder / "clouds").iterdir())) == 12
     ur = (write_example(tmp_path / "ur", "ur") / "dataset.yaml").read_text(encoding="utf-8")
     assert yaml.safe_load(ur) == {**yaml.safe_load(text), "units": {"clouds": "auto", "poses": "auto"}}
-
-
