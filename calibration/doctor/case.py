@@ -58,8 +58,8 @@ class DoctorCase:
     ``robot`` names the arm; ``guess`` is X_BC (4, 4) as a user measured it, good to ``guess_radius`` m at the
     feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
     ``refused`` lists (id, reason); ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have
-    positions only. ``asked`` is what the robot's motion asks of the scanner and no hole circle confirms, a sentence. Every
-    fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
+    positions only. ``asked`` is what the robot's motion asks of the scanner and no hole circle confirms, a sentence.
+    Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
     """
 
     ids: tuple[str, ...]

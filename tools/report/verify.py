@@ -69,8 +69,8 @@ class Verdict:
 class VerifyReport:
     """The result of a verification. ``observations`` include the scanner correction where the result has one.
 
-    ``offset``: how far X_BC is off by the new scans alone; None where they are too few. ``flange`` and ``pose`` are what
-    the options of the same names must state for these files; ``notes`` say how they were read.
+    ``offset``: how far X_BC is off by the new scans alone; None where they are too few. ``flange`` and ``pose`` are
+    what the options of the same names must state for these files; ``notes`` say how they were read.
     """
 
     result: CalibrationResult
