@@ -87,7 +87,7 @@ def test_pairs_lead_to_a_new_solution_in_their_unit(place: Path) -> None:
     steps = follow(f"weldcal verify {name} 'my pairs.npz' --mounting eye_in_hand --unit mm")
     assert [shlex.split(line)[1] for line, _ in steps] == ["verify", "hand-eye"]
     assert "--unit mm" in steps[1][0]
-    assert 1e3 * np.linalg.norm(np.array(steps[1][1]["X_FC"])[:3, 3] - X[:3, 3]) < 1.0
+    assert 1e3 * np.linalg.norm(np.array(steps[1][1]["X"])[:3, 3] - X[:3, 3]) < 1.0
 
 
 @pytest.mark.parametrize("kind", ["scans", "pairs"])
