@@ -126,8 +126,8 @@ class VerifyReport:
             poses = (*poses, ShownPose(f"{judged.symbol}, new solution", words, o.new.X_BC))
             x, y, z = (f"{1e3 * v:+.3f}" for v in o.shift_m)
             more["off by"] = (
-                f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees;"
-                f" the new {judged.symbol} is below. In the base, at the middle of these scans."
+                f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
+                " from the new solution. The vector is in the base, at the middle of these scans."
             )
         return FirstScreen(found, expected, self._next(), poses, more)
 
