@@ -42,7 +42,12 @@ def test_a_missing_flange_is_said_before_any_cloud(
     else:
         (data / "dataset.yaml").unlink()
     read: list[str] = []
-    monkeypatch.setattr("weldcal.calibration.data.dataset.digest", lambda path: read.append(path.name) or "")
+
+    def digest(path: Path) -> str:
+        read.append(path.name)
+        return ""
+
+    monkeypatch.setattr("weldcal.calibration.data.dataset.digest", digest)
     wanted = r"did you mean that of the ur10e\? Add --flange iso9409-1-50-4-m6, or write 'flange: iso9409-1-50-4-m6'"
     with pytest.raises(InputError, match=wanted):
         calibrate_dataset(data, tmp_path / "out", robot=None if plain else "ur10e")

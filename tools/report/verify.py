@@ -120,16 +120,17 @@ class VerifyReport:
                 "error at the flange, 95 %", "not known", "every scan here was used in the calibration"
             )
         judged = scanner_pose(r)
-        poses, more = (replace(judged, symbol=f"{judged.symbol}, judged"),), {}
+        poses = [replace(judged, symbol=f"{judged.symbol}, judged")]
+        more: dict[str, str] = {}
         if (o := self.offset) is not None:
             words = f"{judged.words}, from these scans alone"
-            poses = (*poses, ShownPose(f"{judged.symbol}, new solution", words, o.new.X_BC))
+            poses.append(ShownPose(f"{judged.symbol}, new solution", words, o.new.X_BC))
             x, y, z = (f"{1e3 * v:+.3f}" for v in o.shift_m)
             more["off by"] = (
                 f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
                 " from the new solution. The vector is in the base, at the middle of these scans."
             )
-        return FirstScreen(found, expected, self._next(), poses, more)
+        return FirstScreen(found, expected, self._next(), tuple(poses), more)
 
     def _next(self) -> Next:
         v, flange = self.verdict, ("--flange", self.flange) if self.flange else ()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.stats import chi2
 
@@ -17,7 +18,7 @@ WORLDS, MOVED_M = 60, np.array([8e-4, -5e-4, 3e-4])
 ARM_M, TURN_RAD = 2e-4, 5e-4  # errors of the arm's poses, standard deviations
 
 
-def shown(seed: int, n: int) -> tuple[RigidTransform, list[Observation], np.ndarray]:
+def shown(seed: int, n: int) -> tuple[RigidTransform, list[Observation], NDArray[np.float64]]:
     """A stated X_BC that is displaced and turned, n observations by an arm with errors, and the true offset (3,) m of
     the middle of what the scanner shows."""
     truth, observations = worlds.world(seed)
@@ -33,7 +34,7 @@ def shown(seed: int, n: int) -> tuple[RigidTransform, list[Observation], np.ndar
     return stated, seen, stated @ middle - np.mean([o.p_BR for o in observations[:n]], axis=0)
 
 
-def squares(n: int) -> np.ndarray:
+def squares(n: int) -> NDArray[np.float64]:
     """Squared errors of the offset in units of its covariance (WORLDS,)."""
     found = []
     for seed in range(WORLDS):
