@@ -91,6 +91,20 @@ class Robot:
         return load_chain(self.name)
 
 
+def stated_flange(name: str, robot: str) -> FlangeStandard:
+    """Return the flange of that designation; where none is named, the error names the one of the robot.
+
+    Raises InputError: none is named, or it is not known.
+    """
+    known = ROBOTS.get(robot.lower())
+    if name or known is None:
+        return get_flange(name)
+    raise InputError(
+        f"No flange is named: did you mean that of the {known.name}? Add --flange {known.flange}, or write 'flange:"
+        f" {known.flange}' in dataset.yaml."
+    )
+
+
 # A document that is not open as a whole was read as public repositories quote it.
 _UR_MESH = "meshes of Universal_Robots_ROS2_Description, {}/visual/wrist3.dae"
 _SCANS = "pattern of holes and dowel in the recorded scans"

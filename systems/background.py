@@ -1,8 +1,10 @@
 """Run computations that take longer than a tick beside the control loop, and output their answers."""
 
+import ast
 import importlib
 import multiprocessing
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -10,18 +12,23 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, State
 
-from weldcal.models.errors import WeldcalError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.interrupts import deferred
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 Found = TypeVar("Found")
 NICE = -10  # nine times the share of an ordinary program, and no precedence over a robot's peer that wakes up
+
+
+GUARD = 'if __name__ == "__main__":'
+"""The line below which a script starts its job: the process beside it imports the script."""
 
 
 class BackgroundFailed(WeldcalError):
@@ -51,7 +58,7 @@ class Answer(Message, Generic[Found]):
         except BrokenProcessPool as error:
             raise BackgroundFailed(
                 "The process that computes beside the control loop has ended, perhaps for want of memory: "
-                "close other programs and start again."
+                f"close other programs and start again. Or the script starts its job outside {GUARD}"
             ) from error
 
 
@@ -120,6 +127,9 @@ class OwnProcess:
     _preparing: "list[Future[Any]]" = field(default_factory=list)
     _newest: "tuple[Future[Any], float] | None" = None  # the newest question, and when it was asked
 
+    def __post_init__(self) -> None:
+        require_guard()
+
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """See Background."""
         with deferred():  # the first one starts the process
@@ -150,6 +160,28 @@ class OwnProcess:
     def close(self) -> None:
         """See Background."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def require_guard() -> None:
+    """Check that a new process can import the program's script, as it does, without running its job a second time.
+
+    Raises:
+        InputError: the script has no GUARD, or it starts a job while such a process imports it.
+    """
+    main = sys.modules["__main__"]
+    file, package = getattr(main, "__file__", None), getattr(main.__spec__, "name", "").endswith("__main__")
+    guarded = file is None or package  # neither a notebook nor a package's own __main__ is imported
+    if not guarded:
+        try:
+            tests = [node.test for node in ast.walk(ast.parse(Path(file).read_bytes())) if isinstance(node, ast.If)]
+        except (OSError, SyntaxError, ValueError):  # a program in an archive
+            return
+        guarded = any(getattr(node, "id", "") == "__name__" for test in tests for node in ast.walk(test))
+    if not guarded or getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise InputError(
+            f"The process that computes beside the robot imports '{file}', which would start its job a second time:"
+            f" put what the script runs below {GUARD}"
+        )
 
 
 def import_module(name: str) -> None:

@@ -22,7 +22,7 @@ from weldcal.models.workpieces.part import Part, WeldPart, bend
 from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
 from weldcal.models.workpieces.tack import tacked
-from weldcal.systems.background import Background, Inline, OwnProcess
+from weldcal.systems.background import Background, Inline, OwnProcess, require_guard
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
@@ -187,11 +187,13 @@ def make_station(
     probe: `torch.touch`.
 
     Raises:
-        InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the
-            job.
+        InputError: the scenario has no robot; a script starts a robot's job outside its guard. A driver adds its own:
+            RobotRefused where the robot does not allow the job.
     """
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
+    if played is None and not scenario.robot.SIMULATED:
+        require_guard()
     if robot is None:
         robot = prepare_robot(scenario.robot, nominal_arm(scenario), np.deg2rad(scenario.home_deg))
     opened: list[Closable] = []

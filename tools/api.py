@@ -11,6 +11,7 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data import clouds
+from weldcal.calibration.data.checks import AUTO, UNITS, cloud_unit
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
@@ -112,20 +113,21 @@ def verify(
         return verify_dataset(Path(result), Path(folder), Path(kept_for_now), limit_mm=limit_mm, flange=flange)
 
 
-def read_cloud(file: str | Path, unit: str = "m") -> Floats:
+def read_cloud(file: str | Path, unit: str = "auto") -> Floats:
     """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, of a PLY, PCD, NPZ, NPY or text
     file or a depth image beside a file of its camera.
 
     Args:
-        unit: of the file's numbers, m or mm.
+        unit: of the file's numbers, m or mm; auto is the one in which the points lie 10 mm to 10 m from the camera
+            (median), as `weldcal calibrate` and `weldcal apply` read a file.
 
     Raises:
-        CloudError: the file cannot be read. InputError: another unit.
+        CloudError: the file cannot be read, or neither unit fits. InputError: another unit.
     """
-    metres = {"m": 1.0, "mm": 1e-3}.get(unit)
-    if metres is None:
-        raise InputError(f"The unit of a cloud must be m or mm, not '{unit}'.")
-    return metres * clouds.read_cloud(Path(file))
+    if unit not in (AUTO, *UNITS):
+        raise InputError(f"The unit of a cloud must be auto, m or mm, not '{unit}'.")
+    points = clouds.read_cloud(Path(file))
+    return UNITS[cloud_unit(points, Path(file).name) if unit == AUTO else unit] * points
 
 
 def read_calibration(file: str | Path) -> CalibrationResult:

@@ -264,18 +264,15 @@ def metric_cloud(path: Path, header: DatasetHeader, folder: Path) -> Array:
 
 
 def to_metres(points: Array, unit: str, name: str) -> Array:
-    """The measured points, in place where none is left out, in metres; the unit is m, mm or auto (by their distance).
+    """The measured points, in place where none is left out, in metres; the unit is m, mm or auto (see cloud_unit).
 
     Raises CloudError.
     """
     points = measured(points, name)
-    finite = np.flatnonzero(np.isfinite(points[..., 2]))
-    some = points.reshape(-1, points.shape[-1])[finite[:: 1 + len(finite) // _SAMPLE]]
-    distance = float(np.median(np.linalg.norm(some, axis=1)))
     if unit == AUTO:
-        unit = "mm" if distance > REACH_M[1] else "m"
+        unit = cloud_unit(points, name)
     points *= UNITS[unit]
-    distance *= UNITS[unit]
+    distance = _distance(points)
     if not REACH_M[0] <= distance <= REACH_M[1]:
         other = "mm" if unit == "m" else "m"
         raise CloudError(
@@ -283,6 +280,28 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
             f"units in dataset.yaml to 'clouds: {other}'."
         )
     return points
+
+
+def cloud_unit(points: Array, name: str) -> str:
+    """The unit in which points (..., 3) lie 10 mm to 10 m from the camera (median): m, or mm.
+
+    Raises CloudError: neither is.
+    """
+    distance = _distance(points)
+    for unit, metres in UNITS.items():
+        if REACH_M[0] <= metres * distance <= REACH_M[1]:
+            return unit
+    raise CloudError(
+        f"The points of {name} lie {distance:.3g} from the camera: neither m nor mm puts them 10 mm to 10 m away."
+        " Convert the file to metres."
+    )
+
+
+def _distance(points: Array) -> float:
+    """Median distance of the measured points (..., 3) from the camera, of a sample."""
+    finite = np.flatnonzero(np.isfinite(points[..., 2]))
+    some = points.reshape(-1, points.shape[-1])[finite[:: 1 + len(finite) // _SAMPLE]]
+    return float(np.median(np.linalg.norm(some, axis=1)))
 
 
 def _check_clouds(header: DatasetHeader, path: Path) -> None:

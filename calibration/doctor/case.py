@@ -58,7 +58,8 @@ class DoctorCase:
     ``robot`` names the arm; ``guess`` is X_BC (4, 4) as a user measured it, good to ``guess_radius`` m at the
     feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
     ``refused`` lists (id, reason); ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have
-    positions only. Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
+    positions only. ``asked`` is what the robot's motion asks of the scanner and no hole circle confirms, a sentence.
+    Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
     """
 
     ids: tuple[str, ...]
@@ -78,6 +79,7 @@ class DoctorCase:
     near_far: tuple[float, float] | None = None
     oriented: bool = True
     arm: ArmDerivatives | None = None
+    asked: str = ""
 
     @property
     def n(self) -> int:
@@ -207,6 +209,7 @@ def case_text(case: DoctorCase) -> str:
         "oriented": int(case.oriented),
         "guess_radius": repr(case.guess_radius),
         "near_far": "" if case.near_far is None else ",".join(map(repr, case.near_far)),
+        "asked": case.asked.replace(";", ","),
     }
     out.write(f"# {';'.join(f'{name}={word}' for name, word in words.items())}\n")
     writer.writerow(_COLUMNS)
@@ -260,6 +263,7 @@ def read_case(path: Path) -> DoctorCase:
         refused=tuple((r["id"].split(":", 1)[1], "") for r in rows if r["id"].startswith(f"{_REFUSED}:")),
         near_far=(near_far[0], near_far[1]) if len(near_far) == 2 else None,
         oriented=words.get("oriented", "1") != "0",
+        asked=words.get("asked", ""),
     )
 
 

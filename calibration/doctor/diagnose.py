@@ -364,6 +364,7 @@ LEAST_EFFECT_M = {
 }
 """Smaller ones are what arms and scanners are off anyway."""
 UNEXPLAINED = "unexplained"
+_ASKED = 0.8  # a choice: the motion asks for it at 99 %, but an error of the arm can look the same
 _SURE = 1e5  # of misreadings, which explain by definition what they are named for
 CLEAR = 1.2  # factor by which a cause must bring the median residual down
 
@@ -404,6 +405,7 @@ class Diagnosis:
 def diagnose(case: DoctorCase) -> Diagnosis:
     """Return the causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
+    asked = [Cause("scanner scale error", _ASKED, 1.0, {}, (), case.asked)] if case.asked else []
     if case.fits_flange and case.fits_flange != case.flange:
         causes.append(Cause("wrong flange size", 0.99, 1e8, {}, (), case.fits_flange))
     if case.n >= FEWEST and (mixed := mixed_units(case)) is not None:
@@ -413,15 +415,15 @@ def diagnose(case: DoctorCase) -> Diagnosis:
     if case.n < FEWEST:
         if partial is not None:
             causes.append(Cause(partial.cause, 0.9, partial.score, partial.numbers, partial.where))
+        causes += asked
         if not causes:
             causes.append(Cause("too few scans", 0.9, 1.0, {"n": float(case.n)}))
         return Diagnosis(tuple(causes), case.n, float("nan"))
     bare, case = case, with_arm_errors(case)
     null = fit(case)
-    wrong = looks_wrong(null)
     models = _ranked(case, null)
     winner = next((m for m in models if _named(m, null)), None)
-    if wrong:
+    if looks_wrong(null):
         reading = best_reading(bare, fit(bare))
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
@@ -449,6 +451,7 @@ def diagnose(case: DoctorCase) -> Diagnosis:
     left = _unexplained(bare, best) if not any(c.score > _SURE for c in causes) else None
     if left is not None:
         causes = [left]
+    causes += [cause for cause in asked if cause.name not in named]
     causes.sort(key=lambda c: -c.score)
     turned = turn_deg([as_transform(X) for X in case.X_BF]) if case.oriented else 0.0
     spread = float(np.median(np.linalg.norm(best.e, axis=1)))

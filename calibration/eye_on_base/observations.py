@@ -7,13 +7,18 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.poses.bag import find_bag
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
+from weldcal.calibration.data.poses.source import find_poses
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
@@ -23,6 +28,7 @@ from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import nearest_rotation
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
+from weldcal.models.robots import stated_flange
 
 CHANCE = 1e-6  # a choice: a wrong refusal in a million; a factor of two moves the limit by less than 10 %
 """Chance that the right reading is rejected in favour of a wrong one."""
@@ -55,6 +61,17 @@ class FlangeObservations:
     refused: tuple[tuple[str, str], ...]
     data: Dataset | None = None
     """The dataset with its poses as the scans say that they are to be read; None for pairs."""
+
+
+def require_flange(folder: Path, flange: str | None, robot: str | None = None) -> None:
+    """Check that a dataset's folder or the arguments name a known flange, before any cloud is read.
+
+    Raises InputError, with the usual flange of the robot where none is named.
+    """
+    description = folder / "dataset.yaml"
+    if folder.is_dir() and (description.is_file() or find_poses(folder) or find_bag(folder)):
+        header = read_header(description) if description.is_file() else DatasetHeader()
+        stated_flange(flange or header.flange, robot or header.robot)
 
 
 def fit_flanges(

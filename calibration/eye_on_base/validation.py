@@ -7,14 +7,15 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, sigma_at
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import t_quantile
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.planning.observability import has_orientations, turn_deg
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 
 Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 """Camera pose and scanner correction from observations."""
@@ -24,6 +25,57 @@ def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -
     """Distances (n,) m between the flange centres by the calibration and by the robot."""
     p_C, p_B = (np.array([getattr(o, name) for o in observations]).reshape(-1, 3) for name in ("p_CR", "p_BR"))
     return np.asarray(np.linalg.norm(X_BC.multiply(p_C.T).T - p_B, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Offset:
+    """A stated X_BC beside the one of new scans, compared at the middle ``p_BQ`` (3,) m of their flange centres.
+
+    ``new``: the estimate from these scans alone. ``shift_m`` (3,): the place of that point by the stated pose, less its
+    place by the new one, in B, with its ``covariance`` (3, 3) m^2. ``turn_rad``: the angle between both.
+    """
+
+    new: CalibrationEstimate
+    p_BQ: Array
+    shift_m: Array
+    covariance: Array
+    turn_rad: float
+
+    @property
+    def sigma_m(self) -> float:
+        """Largest standard deviation of ``shift_m``, in any direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+
+def offset_from(X_BC: RigidTransform, observations: Sequence[Observation], seed: int = 0) -> Offset | None:
+    """Return how far a stated X_BC is off by new observations; None where they do not determine a pose.
+
+    In the middle of the centres an error of the scanner's scale does not count: both poses move the same points.
+    """
+    try:
+        new = estimate_eye_on_base(tuple(observations), SolveConfig(seed=seed))
+    except WeldcalError:
+        return None
+    p_CQ = np.mean([o.p_CR for o, keep in zip(observations, new.inliers, strict=True) if keep], axis=0)
+    p_BQ = new.X_BC @ p_CQ
+    turn = float(np.linalg.norm(rotation_vector(X_BC.rotation() @ new.X_BC.rotation().inverse())))
+    return Offset(new, p_BQ, X_BC @ p_CQ - p_BQ, point_error_covariance(new, p_BQ), turn)
+
+
+def scale_error(X_BC: RigidTransform, observations: Sequence[Observation]) -> tuple[float, float]:
+    """Estimate the scale that, with a shift, best explains the errors, and its standard error; NaN for few scans."""
+    n = len(observations)
+    if n < 6:
+        return float("nan"), float("nan")
+    c = np.array([X_BC.rotation() @ o.p_CR for o in observations])
+    e = np.array([o.p_BR - X_BC @ o.p_CR for o in observations])
+    c, e = c - c.mean(axis=0), e - e.mean(axis=0)
+    spread = float((c**2).sum())
+    if spread < 1e-6:
+        return float("nan"), float("nan")
+    scale = float((c * e).sum()) / spread
+    left = float(((e - scale * c) ** 2).sum()) / (3 * n - 4)
+    return scale, float(np.sqrt(left / spread))
 
 
 def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:

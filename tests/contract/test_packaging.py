@@ -34,13 +34,14 @@ class Built:
 
 
 def source_files() -> set[str]:
-    """Every file of the package that must arrive: Python, YAML, CSV, URScript, templates, styles, scripts of pages,
+    """Every file of the package that must arrive: Python, YAML, CSV, scans, URScript, templates, styles, scripts of pages,
     type markers."""
     return set(ROOT_FILES) | {
         path.relative_to(ROOT).as_posix()
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*")
-        if path.suffix in {".py", ".yaml", ".csv", ".script", ".j2", ".css", ".js", ".html"} or path.name == "py.typed"
+        if path.suffix in {".py", ".yaml", ".csv", ".script", ".j2", ".css", ".js", ".html", ".npz"}
+        or path.name == "py.typed"
     }
 
 

@@ -25,7 +25,7 @@ FOCAL_PX = 1500.0
 WINDOW_PX = 260
 
 
-def flange_scan(X_CF: RigidTransform, rng: np.random.Generator) -> Floats:
+def flange_scan(X_CF: RigidTransform, rng: np.random.Generator, *, holes: bool = True) -> Floats:
     """The face of a flange at a pose, seen by a pinhole camera: points (H, W, 3) m in the camera's frame, NaN beside
     it."""
     standard = get_flange(FLANGE)
@@ -37,7 +37,7 @@ def flange_scan(X_CF: RigidTransform, rng: np.random.Generator) -> Floats:
     local = (points - p) @ R
     rho = np.hypot(local[..., 0], local[..., 1])
     seen = (rho < standard.face_outer_radius_m) & (rho > standard.face_inner_radius_m)
-    for x, y, radius in standard.openings():
+    for x, y, radius in standard.openings() if holes else ():
         seen &= np.hypot(local[..., 0] - x, local[..., 1] - y) > radius
     points = points * (1.0 + NOISE_M / p[2] * rng.standard_normal(rho.shape))[..., None]
     return np.where(seen[..., None], points, np.nan)
@@ -53,13 +53,13 @@ def flange_poses(n: int, rng: np.random.Generator) -> list[RigidTransform]:
     return poses
 
 
-def write_scans(folder: Path, n: int, seed: int) -> Path:
-    """A dataset of n scans, pose01 and so on, of a scanner at X_BC."""
+def write_scans(folder: Path, n: int, seed: int, *, scale: float = 1.0, holes: bool = True) -> Path:
+    """A dataset of n scans, pose01 and so on, of a scanner at X_BC that measures ``scale`` times what is true."""
     rng = np.random.default_rng(seed)
     poses = {f"pose{k + 1:02d}": X_CF for k, X_CF in enumerate(flange_poses(n, rng))}
     header = DatasetHeader(schema=1, robot="ur10e", flange=FLANGE, scanner="phoxi_m", configuration="eye_on_base")
     header.scanner_guess = ScannerGuess(xyz=[0.65, 0.0, 0.95], wxyz=X_BC.rotation().ToQuaternion().wxyz().tolist())
-    clouds = {id: flange_scan(X_CF, rng) for id, X_CF in poses.items()}
+    clouds = {id: scale * flange_scan(X_CF, rng, holes=holes) for id, X_CF in poses.items()}
     save_dataset(folder, header, {id: X_BC @ X_CF for id, X_CF in poses.items()}, clouds)
     _add_joints(folder / "poses.csv", list(poses.values()))
     return folder

@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -164,6 +165,19 @@ def test_the_robot_is_refused_then_ready_then_moved(executed: Executed) -> None:
     assert "The operator ended the job" in printed
     start = np.array([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # of an emulated controller
     assert np.abs(np.array(ast.literal_eval(ready[1])) - start).max() > 20.0
+
+
+def test_a_robot_runs_as_a_script_below_its_guard(tmp_path: Path) -> None:
+    body = textwrap.indent("\n".join(cells("a_robot")), "    ")
+    (tmp_path / "robot.py").write_text(f'if __name__ == "__main__":\n{body}\n')
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "robot.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.count("The operator ended the job") == 1
+    assert len(re.findall(r"^ready \[", done.stdout, re.MULTILINE)) == 2
 
 
 def test_the_code_passes_the_strict_rules_of_pyright(tmp_path: Path) -> None:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw
+from typer.testing import CliRunner
 
 import weldcal
 from tests.documents.scans import write_scans
+from weldcal.calibration.data.checks import metric_cloud
+from weldcal.calibration.data.clouds import CloudError
+from weldcal.calibration.data.header import DatasetHeader, Units
+from weldcal.calibration.data.results import CalibrationResult, save_result
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import write_example
 
 
@@ -60,7 +68,7 @@ def test_poses_of_another_shape_are_refused_in_a_sentence(shape: tuple[int, ...]
 def test_an_example_is_not_written_over_something(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty: choose another folder"):
-        write_example(tmp_path, 0)
+        write_example(tmp_path)
 
 
 def test_a_cell_shows_its_plant_its_viewer_and_its_named_logs() -> None:
@@ -76,3 +84,27 @@ def test_a_cell_shows_its_plant_its_viewer_and_its_named_logs() -> None:
         assert all(cell.diagram.GetSubsystemByName(f"log_{name}") is sink for name, sink in cell.logs.items())
     finally:
         cell.station.close()
+
+
+def test_read_cloud_finds_the_unit_as_calibrate_and_apply_do(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    metres = rng.uniform([-0.1, -0.1, 0.55], [0.1, 0.1, 0.65], (300, 3))
+    save_result(
+        CalibrationResult(X_BC=RigidTransform(), covariance=np.eye(6), held_out_mm={}, tilt_deg={}, poses=()), tmp_path
+    )
+    for unit, factor in (("mm", 1e3), ("m", 1.0)):
+        path = tmp_path / f"in_{unit}.ply"
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(factor * metres))
+        assert o3d.io.write_point_cloud(path, cloud)
+        assert weldcal.read_cloud(path) == pytest.approx(metres, abs=1e-6)
+        assert weldcal.read_cloud(path, "m") == pytest.approx(factor * metres, rel=1e-6)
+        words = ["apply", str(tmp_path), str(path), str(tmp_path / f"out_{unit}.npy"), "--json"]
+        assert json.loads(CliRunner().invoke(app, words).stdout.splitlines()[-1])["unit"] == unit
+        header = DatasetHeader(units=Units("auto", "auto"))
+        assert metric_cloud(path, header, tmp_path) == pytest.approx(metres, abs=1e-6)
+    far = tmp_path / "far.npy"
+    np.save(far, 1e6 * metres)
+    with pytest.raises(CloudError, match=r"far\.npy lie 6.* neither m nor mm"):
+        weldcal.read_cloud(far)
+    with pytest.raises(InputError, match="must be auto, m or mm, not 'inch'"):
+        weldcal.read_cloud(far, "inch")

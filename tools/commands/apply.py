@@ -7,6 +7,7 @@ import numpy as np
 import typer
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.checks import UNITS, cloud_unit
 from weldcal.calibration.data.clouds import cloud_id, read_cloud
 from weldcal.calibration.data.results import load_correction, load_result
 from weldcal.models.arrays import Array
@@ -14,7 +15,6 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 FORMS = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz")
-FARTHEST_M = 20.0  # a choice: no 3D scanner of this size of flange measures farther; a larger median is millimetres
 
 
 @command("apply", common=("overwrite", "json", "debug"), short_help="Correct the points of a scan by a calibration.")
@@ -47,7 +47,7 @@ def apply(
     if unit not in ("", "m", "mm"):
         raise InputError(f"--unit must be m or mm, not '{unit}'.")
     given = read_cloud(cloud)
-    length = {"m": 1.0, "mm": 1e-3}[unit or ("mm" if np.nanmedian(np.abs(given[..., 2])) > FARTHEST_M else "m")]
+    length = UNITS[unit or cloud_unit(given, cloud.name)]
     measured = length * given
     corrected = measured if correction is None else correction.points(measured)
     points = corrected @ X_BC.rotation().matrix().T + X_BC.translation()

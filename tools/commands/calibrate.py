@@ -24,7 +24,7 @@ from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges, require_flange
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold, sampling_advice
@@ -216,6 +216,7 @@ def calibrate_dataset(
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    require_flange(Path(folder), flange, robot)
     data = load_dataset(Path(folder), robot=robot or "")
     if poses is not None:
         data = data.between(poses)
@@ -294,9 +295,11 @@ def calibrate_dataset(
         warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
+    unconfirmed: list[str] = []
     if correct_scanner and not confirmed and not few:
         asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
-        warnings += _unconfirmed(asked, verdict)
+        unconfirmed = _unconfirmed(asked, verdict)
+        warnings += unconfirmed
         if refined is None:
             estimate = left_uncorrected(estimate, asked)
     correction = None if found.correction is None else found.correction.document()
@@ -368,7 +371,7 @@ def calibrate_dataset(
         write_atomic(Path(out) / KINEMATICS_FILE, refined.kinematics)
     if centres:
         write_atomic(Path(out) / "centres.csv", _centres_csv(observations))
-    write_case(Path(out), dataset_case(data, seen, standard, standard))
+    write_case(Path(out), replace(dataset_case(data, seen, standard, standard), asked="".join(unconfirmed)))
     # last, so that its presence means that everything else is there
     save_result(result, Path(out))
     report = replace(report, seconds=time.monotonic() - started)

@@ -18,7 +18,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
+from weldcal.models.robots import stated_flange
 from weldcal.tools.cli.options import Call, FlangeOption, LimitOption, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import check_limit
@@ -81,7 +81,7 @@ def calibrate_motion(
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
     data = load_motion_dataset(Path(folder), robot=robot)
-    standard = get_flange(flange or data.header.flange)
+    standard = stated_flange(flange or data.header.flange, data.header.robot)
     motion = ContinuousMotion(data.stream, inverted=data.in_hand)
     seen = see_frames(data, standard, motion, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.8 * fraction))
     frames = seen.observed

@@ -15,7 +15,7 @@ from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.doctor.case import NAME, DoctorCase, dataset_case, read_case
 from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
-from weldcal.calibration.eye_on_base.observations import fit_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges, require_flange
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole
@@ -92,6 +92,7 @@ def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Prog
     Raises:
         InputError: the dataset cannot be read, and not because of its units.
     """
+    require_flange(folder, flange)
     try:
         data = load_dataset(folder)
     except DatasetError as refusal:

@@ -1,6 +1,7 @@
 """`weldcal verify RESULT DATASET`: judges a calibration by its errors at the flange on scans that it did not use."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection, corre
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
-from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
+from weldcal.calibration.eye_on_base.validation import offset_from, position_errors, scale_error, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.planning.observability import turn_deg
@@ -141,7 +142,6 @@ def verify(
         assert touch is not None
         return touches_outcome(call, result, touch)
     of_pairs = {
-        "--mounting": mounting,
         "--unit": unit,
         "--robot-poses": robot_poses,
         "--camera-poses": camera_poses,
@@ -162,6 +162,9 @@ def verify(
             intrinsics=intrinsics,
             stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
             seed=call.seed,
+            options=tuple(
+                word for name in of_pairs if of_pairs[name] for word in (name, shlex.quote(f"{of_pairs[name]}"))
+            ),
         )
         settled = paired.verdict
         return Outcome(
@@ -171,7 +174,7 @@ def verify(
             first=paired.first,
             problem=f"The verdict is: {settled.verdict}. {settled.reason}" if settled.verdict == DO_NOT else "",
         )
-    surplus = next((name for name, value in of_pairs.items() if value is not None), None)
+    surplus = next((name for name, value in {**of_pairs, "--mounting": mounting}.items() if value is not None), None)
     if surplus is not None:
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
     report = verify_dataset(
@@ -269,12 +272,13 @@ def verify_dataset(
     verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
     if other_arm.strip() not in verdict.reason:
         verdict = replace(verdict, reason=f"{other_arm}{verdict.reason}")
+    without, evident = _uncorrected(calibration, observations)
     warnings = (
         *differences,
-        *read_as,
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
         *_diagnostics(calibration, data, observations, poses),
+        *(without if evident else ()),
     )
     report = VerifyReport(
         result=calibration,
@@ -290,6 +294,10 @@ def verify_dataset(
         source=source,
         dataset=str(dataset),
         calibration=str(result),
+        notes=read_as if evident else (*read_as, *without),
+        offset=offset_from(calibration.X_BC, [observations[k] for k in new], seed),
+        flange=standard.designation if flange or not data.header.flange else "",
+        pose=pose or "",
     )
     tell("writing the report", 0.9)
     write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))
@@ -469,31 +477,15 @@ def _diagnostics(
             f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the flange's z axis in the poses."
             " Check the quaternion order (qw, qx, qy, qz), that the poses are the flange's, and the calibration."
         )
-    if result.scanner_correction is None:
-        out.append(_uncorrected(result, observations))
     return out
 
 
-def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...]) -> str:
-    """Return the warning about an absent scanner correction, with the scale error where these scans show one."""
+def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[tuple[str, ...], bool]:
+    """Return a sentence on an absent scanner correction (none: there is one), and whether these scans show its lack."""
+    if result.scanner_correction is not None:
+        return (), False
     text = "The result holds no scanner correction, so these errors include the scale error of the scanner"
-    scale, sigma = _scale_error(result, observations)
+    scale, sigma = scale_error(result.X_BC, observations)
     if np.isfinite(sigma) and abs(scale) > _EVIDENT * sigma:
-        return f"{text}: these scans show {1e2 * scale:+.2f} % (one sigma {1e2 * sigma:.2f} %)."
-    return f"{text}, if there is one."
-
-
-def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
-    """Estimate the scale that, with a shift, best explains the errors, and its standard error; NaN for few scans."""
-    n = len(observations)
-    if n < 6:
-        return float("nan"), float("nan")
-    c = np.array([result.X_BC.rotation() @ o.p_CR for o in observations])
-    e = np.array([o.p_BR - result.X_BC @ o.p_CR for o in observations])
-    c, e = c - c.mean(axis=0), e - e.mean(axis=0)
-    spread = float((c**2).sum())
-    if spread < 1e-6:
-        return float("nan"), float("nan")
-    scale = float((c * e).sum()) / spread
-    left = float(((e - scale * c) ** 2).sum()) / (3 * n - 4)
-    return scale, float(np.sqrt(left / spread))
+        return (f"{text}: these scans show {1e2 * scale:+.2f} % (one sigma {1e2 * sigma:.2f} %).",), True
+    return (f"{text}, if there is one.",), False

@@ -62,6 +62,7 @@ def verify_on_pairs(
     board: str | None = None,
     intrinsics: Path | None = None,
     seed: int = 0,
+    options: tuple[str, ...] = (),
 ) -> PairsReport:
     """Judge the pose in a file on pairs; write verification.json and report.html to ``out`` (None: nothing is written).
 
@@ -72,6 +73,7 @@ def verify_on_pairs(
         unit, stated: how the pairs are written, as with `hand-eye`.
         pose: key of the pose, where the result's file holds several.
         limit_mm: error at the target that the job allows.
+        options: further words with which a command reads the pairs, for the next step.
         board, intrinsics: the board in the pictures of the folder ``pairs``, and the file of their camera.
 
     Raises:
@@ -112,6 +114,7 @@ def verify_on_pairs(
         notes=read.notes,
         mounting_stated=given.mounting,
         board=board or "",
+        options=options,
     )
     if out is not None:
         write_atomic(out / "report.html", verify_pairs_report(report))

@@ -331,6 +331,8 @@ def _held(c: Cause) -> tuple[str, str]:
 
 
 def _scale(c: Cause) -> tuple[str, str]:
+    if c.words:
+        return c.words, "Scan nearer, or with more pixels, so that three scans or more show the flange's holes."
     return (
         (
             f"The scans are {abs(c.numbers['percent']):.2f} % too {'small' if c.numbers['percent'] > 0 else 'large'};"

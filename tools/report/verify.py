@@ -1,6 +1,7 @@
 """The results of weldcal verify on scans and on touches, and their pages: every error beside the stated ones."""
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.validation import Offset
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
@@ -21,6 +23,7 @@ from weldcal.tools.report.first_screen import (
     Findings,
     FirstScreen,
     Next,
+    ShownPose,
     Tolerance,
     typed,
 )
@@ -42,6 +45,7 @@ class PoseError:
 
 
 NONE = "not a verification"
+ANY_LIMIT_MM = 0.5  # a choice: that of docs/first_hour/your_scans.md
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,11 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyReport:
-    """The result of a verification. ``observations`` include the scanner correction where the result has one."""
+    """The result of a verification. ``observations`` include the scanner correction where the result has one.
+
+    ``offset``: how far X_BC is off by the new scans alone; None where they are too few. ``flange`` and ``pose`` are
+    what the options of the same names must state for these files; ``notes`` say how they were read.
+    """
 
     result: CalibrationResult
     correction: ScannerCorrection | None
@@ -78,6 +86,10 @@ class VerifyReport:
     source: str = ""
     dataset: str = "NEW_SCANS"
     calibration: str = RESULT_FILE
+    notes: tuple[str, ...] = ()
+    offset: Offset | None = None
+    flange: str = ""
+    pose: str = ""
 
     @property
     def first(self) -> FirstScreen:
@@ -93,7 +105,7 @@ class VerifyReport:
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (correction_note(r, self.calibration),))),
+            notes=tuple(filter(None, (*self.notes, correction_note(r, self.calibration)))),
             settled=settled,
         )
         if len(new):
@@ -107,17 +119,37 @@ class VerifyReport:
             expected = ExpectedError(
                 "error at the flange, 95 %", "not known", "every scan here was used in the calibration"
             )
-        return FirstScreen(found, expected, self._next(), (scanner_pose(r),))
+        judged = scanner_pose(r)
+        poses = [replace(judged, symbol=f"{judged.symbol}, judged")]
+        more: dict[str, str] = {}
+        if (o := self.offset) is not None:
+            words = f"{judged.words}, from these scans alone"
+            poses.append(ShownPose(f"{judged.symbol}, new solution", words, o.new.X_BC))
+            x, y, z = (f"{1e3 * v:+.3f}" for v in o.shift_m)
+            more["off by"] = (
+                f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
+                " from the new solution. The vector is in the base, at the middle of these scans."
+            )
+        return FirstScreen(found, expected, self._next(), tuple(poses), more)
 
     def _next(self) -> Next:
-        v = self.verdict
+        v, flange = self.verdict, ("--flange", self.flange) if self.flange else ()
+        held = None if self.offset is None else 1e3 * float(np.nanmedian(self.offset.new.held_out.position_m))
         if v.verdict == USE:
             return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
+        if v.verdict == DO_NOT and held is not None and v.limit_mm is not None and held <= v.limit_mm:
+            text = "These scans agree with each other: calibrate from them, and verify that result on other scans."
+            return Next(text, typed("calibrate", self.dataset, *flange))
         if v.verdict == DO_NOT:
-            return Next("See what has changed, then calibrate again.", typed("doctor", self.dataset))
+            return Next("See what has changed, then calibrate again.", typed("doctor", self.dataset, *flange))
         if v.verdict == NONE or sum(not p.used_before for p in self.poses) < ENOUGH_UNSEEN:
             return Next("Take four or more new scans across the work space, and verify with them.")
-        return Next("Remove what could be wrong, then verify again.", typed("doctor", self.dataset))
+        if v.limit_mm is None:
+            pose = ("--pose", shlex.quote(self.pose)) if self.pose else ()
+            given = (shlex.quote(self.dataset), *flange, *pose, "--limit-mm", f"{ANY_LIMIT_MM:g}")
+            text = f"State the error that your job allows, such as {ANY_LIMIT_MM:g} mm."
+            return Next(text, typed("verify", self.calibration, *given))
+        return Next("Remove what could be wrong, then verify again.", typed("doctor", self.dataset, *flange))
 
     @property
     def position_error_mm(self) -> dict[str, float]:
@@ -146,6 +178,22 @@ class VerifyReport:
             "tilt_deg": self.tilt_deg,
             "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
+            "X": self.result.X_BC.GetAsMatrix4().tolist(),
+            **self._off(),
+        }
+
+    def _off(self) -> dict[str, Any]:
+        """The JSON keys of the offset, null where it is not known."""
+        o = self.offset
+        if o is None:
+            return dict.fromkeys(("off_mm", "off_xyz_mm", "off_sigma_mm", "off_deg", "new"))
+        return {
+            "off_mm": 1e3 * float(np.linalg.norm(o.shift_m)),
+            "off_xyz_mm": (1e3 * o.shift_m).tolist(),
+            "off_sigma_mm": (1e3 * np.sqrt(np.diag(o.covariance))).tolist(),
+            "off_deg": float(np.degrees(o.turn_rad)),
+            "new": {"X": o.new.X_BC.GetAsMatrix4().tolist(), "at_mm": (1e3 * o.p_BQ).tolist()},
         }
 
 

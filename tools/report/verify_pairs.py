@@ -17,6 +17,7 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     ShownPose,
+    typed,
     upper,
 )
 from weldcal.tools.report.pictures import error_bars
@@ -41,6 +42,7 @@ class PairsReport:
         reading, notes: how the pairs were understood.
         mounting_stated: the mounting that the result names, or None.
         board: the board, where the pairs are pictures of it.
+        options: further words of a command that reads the pairs.
     """
 
     judgement: Judgement
@@ -55,6 +57,7 @@ class PairsReport:
     notes: tuple[str, ...] = ()
     mounting_stated: str | None = None
     board: str = ""
+    options: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -126,9 +129,10 @@ class PairsReport:
         )
         unknown = self.mounting.unknowns["X"]
         words = f"pose of the {unknown.child_words} in the {unknown.parent_words} frame"
-        poses = [ShownPose(unknown.symbol, f"{words}, as RESULT states it", as_transform(j.X))]
+        poses = [ShownPose(f"{unknown.symbol}, judged", f"{words}, as RESULT states it", as_transform(j.X))]
         if j.new is not None:
-            poses.append(ShownPose(unknown.symbol, f"{words}, from these pairs alone", j.new.X))
+            name = f"{unknown.symbol}, new solution"
+            poses.append(ShownPose(name, f"{words}, from these pairs alone", j.new.X))
         return FirstScreen(
             Findings(settled=settled, notes=self.notes, concerns=self.warnings), expected, self._next(), tuple(poses)
         )
@@ -141,8 +145,8 @@ class PairsReport:
 
     def _next(self) -> Next:
         v = self.verdict.verdict
-        board = f" --board {self.board}" if self.board else ""
-        solve = f"weldcal hand-eye ax-yb {self.pairs} --mounting {self.mounting.name}{board}"
+        board = ("--board", self.board) if self.board else ()
+        solve = typed("hand-eye ax-yb", self.pairs, "--mounting", self.mounting.name, *board, *self.options)
         if v == USE:
             return Next("Use RESULT. Verify again after work at the robot or the camera.")
         if v == DO_NOT and self.judgement.other is not None:

@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
+from weldcal.systems.background import require_guard
 from weldcal.systems.drivers.sensors.acquisition import POLL_S, Delivery, DeviceFault, DeviceLost, Garbage, Source
 from weldcal.systems.interrupts import deferred
 
@@ -72,6 +73,7 @@ class SourceProcess(Source[Datum]):
 
     def _start(self) -> None:
         self.end()
+        require_guard()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._make, self._arguments), daemon=True)

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from typer.testing import CliRunner
 
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite, write_bag
 from weldcal.tools.commands.cell.new import FILES, write_example
 
@@ -49,7 +47,7 @@ def test_every_form_is_the_same_dataset(folder: Path, form: str) -> None:
 def test_an_unknown_form_is_named_before_any_scan(tmp_path: Path) -> None:
     assert set(FILES) == set(FORMS)
     with pytest.raises(InputError, match="no form 'kuka': use ur, matrices"):
-        write_example(tmp_path / "x", 0, form="kuka")
+        write_example(tmp_path / "x", "kuka")
     assert not (tmp_path / "x").exists()
 
 
@@ -72,13 +70,3 @@ def test_a_recording_without_its_reader_says_what_to_install(folder: Path, monke
     (folder / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(DatasetError, match=r"install the package for it: pip install 'weldcal\[ros\]'"):
         load_dataset(folder)
-
-
-def test_an_example_says_first_how_long_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> Path:
-        raise InputError("It was begun.")
-
-    monkeypatch.setattr("weldcal.tools.commands.cell.new.write_example", fails)
-    words = ["new", str(tmp_path / "x"), "--dataset"]
-    assert CliRunner().invoke(app, words).stdout.splitlines()[0].endswith("takes about two minutes.")
-    assert "minutes" not in CliRunner().invoke(app, [*words, "--json"]).stdout

@@ -1,6 +1,5 @@
 """Rewrites a calibration dataset in another form that people use: UR vectors, matrices, OpenCV, Zivid-like, ROS."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pydrake.common.yaml import yaml_dump
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
@@ -39,7 +39,7 @@ def rewrite(folder: Path, form: str) -> Path:
         shutil.rmtree(folder / "clouds")
     (folder / "poses.csv").unlink()
     header = {k: v for k, v in header.items() if v is not None} | {"units": {"clouds": "auto", "poses": "auto"}}
-    (folder / "dataset.yaml").write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")  # JSON is YAML
+    (folder / "dataset.yaml").write_text(yaml_dump(header), encoding="utf-8")
     return folder
 
 

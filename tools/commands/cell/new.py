@@ -33,7 +33,7 @@ from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam, Scan
-from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, SeamConfig, ToolFile, WorkpieceConfig
 from weldcal.systems.station import Station, make_station
@@ -42,20 +42,17 @@ from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
 from weldcal.tools.commands.cell.scan_poses import add_scan_poses
 from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.cell.screen import MOST_TRIED, joint_of, least_pipe, to_try, unit_hint, ways
-from weldcal.tools.commands.run import run_job
-from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.first_screen import typed
-from weldcal.tools.report.run import RunOptions
 from weldcal.welding.seam.clearance import NoClearance, check_beside
 
-BASE, EXAMPLE = "s_groove", "calibrate_only"
-SMALL = "scanner: {width: 412, height: 308}"  # pixels of the example's scans: a few hundred kB each
+BASE = "s_groove"
+EXAMPLE = Path(__file__).parent / "example_scans"  # made by tests/documents/example_scans.py
 README = """# An example of a calibration dataset
 
 Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal calibrate {folder}
 
-    dataset.yaml   the robot, its flange, the scanner, the units, and where the scanner stands roughly
-    poses.csv      id, x, y, z (m), qw, qx, qy, qz, time (s): the flange in the robot's base, TCP zero, at each scan
+    dataset.yaml   the robot, its flange, the scanner, the units
+    poses.csv      id, x, y, z (m), qw, qx, qy, qz: the flange in the robot's base, TCP zero, at each scan
     clouds/ID.npz  the scan of that pose in the camera's frame; ply and pcd are read too
 
 Put your own scans and poses in their place. Eight to twelve poses, tilted and turned, spread over the working volume,
@@ -65,7 +62,7 @@ OTHER = """# An example of a calibration dataset: {form}
 
 Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal calibrate {folder}
 
-    dataset.yaml   the robot, its flange, the scanner, and where the scanner stands roughly
+    dataset.yaml   the robot, its flange, the scanner
     {files}
 
 docs/datasets.md lists the forms that are read. Put your own scans and poses in the place of these.
@@ -132,7 +129,7 @@ def new(
         Path | None, option("--tool-file", "FILE", "Weld with this tool; tip_1p5 is weldcal's for laps from 1.5 mm.")
     ] = None,
     dataset: Annotated[
-        bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
+        bool, switch("--dataset", "Write an example of a calibration dataset instead: twelve scans, from simulation.")
     ] = False,
     form: Annotated[
         str,
@@ -144,9 +141,7 @@ def new(
     if form and not dataset:
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
-        if not call.json:
-            typer.echo("The scans are rendered in simulation, which takes about two minutes.")
-        written = write_example(folder, call.seed, call.progress, form)
+        written = write_example(folder, form)
         following, note = typed("calibrate", written), {}
     else:
         numbers = tuple(edge_numbers(edges))
@@ -176,8 +171,8 @@ def edge_numbers(text: str) -> list[int]:
     return [int(word) for word in words]
 
 
-def write_example(folder: Path, seed: int, progress: Progress = no_progress, form: str = "") -> Path:
-    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur ...).
+def write_example(folder: Path, form: str = "") -> Path:
+    """Write the scans that weldcal brings as a dataset, in weldcal's own form or another (ur ...).
 
     Raises:
         InputError: there is something in the folder already, or no such form.
@@ -186,18 +181,12 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
         raise InputError(f"There is no form '{form}': use {', '.join(FORMS)}.")
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"'{folder}' is not empty: choose another folder.")
-    scenario = load_scenario(EXAMPLE, SMALL)
-    finished = run_job(scenario, RunOptions(scenario=EXAMPLE, out=folder, seed=seed, recording=False), progress, "")
-    progress("write", 0.99)
-    status = finished.cell.job.calibration_status(finished.run.root)
-    written = write_scans(finished.run, status, folder)
-    if written is None:
-        raise InputError("No scan of the flange was taken: give another --seed.")
+    shutil.copytree(EXAMPLE, folder, dirs_exist_ok=True)
     text = OTHER.format(folder=folder, form=form, files=FILES[form]) if form else README.format(folder=folder)
     if form:
         rewrite(folder, form)
     write_atomic(folder / "README.md", text)
-    return written
+    return folder
 
 
 @dataclass(frozen=True)
