@@ -107,7 +107,7 @@ def tool_check(
     return Outcome(
         report.summary(),
         values={},
-        rows=report.rows(),
+        rows=report.rows(call.verbose),
         problem="" if report.verdict.tolerance == HOLDS else f"{report.verdict.reason} {report.verdict.cause}".strip(),
     )
 
@@ -152,7 +152,7 @@ def tool_measure(
         call.folder("tool-measure", dataset.resolve().name),
         call.progress,
     )
-    return Outcome(report.summary(), values={}, rows=report.rows())
+    return Outcome(report.summary(), values={}, rows=report.rows(call.verbose))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,8 +215,8 @@ class MeasureReport:
             "folder": str(self.folder),
         }
 
-    def rows(self) -> dict[str, str]:
-        """What was found, in lines."""
+    def rows(self, every: bool = True) -> dict[str, str]:
+        """What was found, in lines, the verdict first; not `every`: without axis and notes."""
         f = self.found
         rows = {"verdict": self.verdict.reason, "cause": self.verdict.cause}
         for m in f.moves:
@@ -229,8 +229,9 @@ class MeasureReport:
             rows["stick-out"] = f"{1e3 * f.stick_out_m:.1f} +- {2e3 * f.stick_out_sigma_m:.1f} mm"
         point = "({:.2f}, {:.2f}, {:.2f}) mm".format(*_mm(f.p_FW))
         rows["wire point"] = point if f.wire is not None else "not measured: the wire was not touched"
-        rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
-        rows |= {f"note {k + 1}": note for k, note in enumerate(f.notes)}
+        if every:
+            rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
+            rows |= {f"note {k + 1}": note for k, note in enumerate(f.notes)}
         return rows | {"next": self.following, "page": str(self.folder / "report.html")}
 
 
@@ -354,7 +355,7 @@ def run_tool_scan(
         return Outcome(held | about | run.timing(), values={}, problem=run.reason or "")
     asked = order(dataset=folder, calibration=Path(config.result), tool=loaded.file)
     report = run_measurement(asked, options.out, lambda stage, share: progress(stage, 0.9 + 0.1 * share))
-    return Outcome(report.summary() | about | run.timing(), values={}, rows={"scans": str(len(poses)), **report.rows()})
+    return Outcome(report.summary() | about | run.timing(), values={}, rows={**report.rows(), "scans": str(len(poses))})
 
 
 def _mm(p: Any) -> list[float]:
