@@ -152,7 +152,7 @@ def _names(reader: Any, shape: Any) -> list[str]:
         entity = made.EntityFromShapeResult(solid, 1)  # None of a body in another file
         if isinstance(entity, StepRepr_NextAssemblyUsageOccurrence):
             entity = entity.RelatedProductDefinition().Formation().OfProduct()
-        name = entity.Name() if hasattr(entity, "Name") else None
+        name = getattr(entity, "Name", lambda: None)()
         words = "" if name is None else name.ToCString().strip()
         found.append("" if words.startswith(_UNNAMED) else words)
     return found

@@ -78,7 +78,8 @@ def test_only_verbose_lists_the_edges_joints_first(step: Path, tmp_path: Path) -
     words = ["part", str(step), "--plan", "0", "--out", str(tmp_path / "out")]
     assert "convex" not in CliRunner().invoke(app, words).stdout
     result = CliRunner().invoke(app, [*words, "-v", "--overwrite"])
-    rows = [line.split() for line in result.stdout.splitlines()[1:]]
+    assert result.stdout.startswith("part: the tool fits 2 seams")
+    rows = [line.split() for line in result.stdout.partition("start -> end, mm\n")[2].splitlines()]
     assert [row[1] for row in rows[:3]] == ["concave", "concave", "convex"]
     assert rows[0][2:4] == ["180.00", "90.0"]
 

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import flange_mesh
-from weldcal.models.mesh import TriMesh, revolve
+from weldcal.models.mesh import TriMesh, circle, revolve
 from weldcal.models.robots import ROBOTS
 from weldcal.models.tool import ToolShape
 from weldcal.models.tools.enclosing import shape_mesh
@@ -115,13 +115,12 @@ class ToolCheck:
     @cached_property
     def contradictions(self) -> list[str]:
         """What of the file contradicts its own bodies: a body that nothing carries, a wire point beside the torch."""
-        t, found, r = self.loaded.tool, list[str](), FLANGE_M
+        t, found = self.loaded.tool, list[str]()
         bodies = [(s.name, _shape_points(s)) for s in t.drawn()]
         if not bodies:
             return ["No body is drawn, so the file cannot be compared with itself: add shapes."]
-        around = np.linspace(0.0, 2.0 * np.pi, _SEGMENTS)
-        circle = np.column_stack([r * np.cos(around), r * np.sin(around), np.zeros(_SEGMENTS)])
-        carried, loose = [np.vstack([circle, circle - [0.0, 0.0, r]])], bodies
+        rim = np.column_stack([circle(FLANGE_M, _SEGMENTS), np.zeros(_SEGMENTS)])
+        carried, loose = [np.vstack([rim, rim - [0.0, 0.0, FLANGE_M]])], bodies
         while near := [b for b in loose if min(apart_m(b[1], c) for c in carried) <= GAP_M]:
             carried, loose = [*carried, *(p for _, p in near)], [b for b in loose if b not in near]
         if loose:

@@ -27,7 +27,7 @@ from weldcal.tools.commands.cell.screen import (
     side_of,
     unit_hint,
 )
-from weldcal.tools.console import emit_summary, emit_text
+from weldcal.tools.console import emit_summary
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import csv_text, fixed, render, write_atomic
 
@@ -65,17 +65,16 @@ def part(
     call.progress("draw", 0.9)
     folder = call.folder("part", file.name)
     more = [] if tool == WELDING else ["--tool-file", shlex.quote(str(tool))]
-    make = partial(new_command, file, [*more, *([] if units is None else ["--units", units])])
+    more += [] if units is None else ["--units", units]
+
+    def make(offer: Offer) -> str:
+        return typed("new my_cell --part", file, "--edges", ",".join(map(str, offer.edges)), *more)
+
     write_part(shape, seams, folder, make)
     summary = {**as_json(shape, folder), "seams": [seam.as_row() for seam in seams]}
     first = next((offer for seam in seams for offer in seam.offers), None)
     summary["next"] = "" if first is None else make(first)
     return Outcome(summary, text=partial(emit_table, shape, seams, folder, summary["next"], file, call.verbose))
-
-
-def new_command(file: Path, more: list[str], offer: Offer) -> str:
-    """Return the command that makes a cell which welds what is offered."""
-    return typed("new my_cell --part", file, "--edges", ",".join(map(str, offer.edges)), *more)
 
 
 def with_plans(
@@ -88,8 +87,7 @@ def with_plans(
     answers = planned(OwnPart(file, units=units), [seam.joint.edges for seam in asked], tool, progress)
     found = []
     for seam, (offers, refused) in zip(asked, answers, strict=False):
-        alone = len(seam.joint.edges) == 1
-        each = [why if alone else f"{edges_text(ids)}: {why}" for ids, why in by_reason(refused)]
+        each = [f"{edges_text(ids)}: {why}" if len(refused) > 1 else why for ids, why in by_reason(refused)]
         reason = "" if offers else seam.reason or " ".join(each)
         found.append(replace(seam, reason=reason, offers=tuple(offers), refused=refused, planned=True))
     rest = seams[len(found) :]
@@ -130,33 +128,29 @@ def as_json(shape: PartShape, folder: Path) -> dict[str, object]:
 
 def emit_table(shape: PartShape, seams: list[Seam], folder: Path, following: str, file: Path, verbose: bool) -> None:
     """Print what can be welded, the next command and the page; `verbose`: and each edge and refusal."""
+    size = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(shape.mesh.vertices, axis=0))
+    about = {"part": f"{shape.name}: {size} mm, {shape.bodies} bod{'ies' if shape.bodies > 1 else 'y'}"}
+    last = {"note": outside_hint(shape), "unit": unit_hint(shape)}
+    entries = page_rows(shape, seams)
+    good, bad = ([e for e in entries if (e["state"] != "no") == wanted] for wanted in (True, False))
+    asks = "" if following or not good else typed("part", file)
+    last |= {"next": following or asks, "page": f"{folder / PAGE} (-v lists every edge and refusal)"}
+    for shown in range(len(entries), -1, -1):
+        named = [f"seam {k + 1}" for k in range(len(good))] + [f"not {k + 1}" for k in range(len(bad))]
+        rows = {
+            name: f"{e['named']}: {e['type']}, {e['length']} mm, {e['angle']} deg. {e['verdict']}"
+            for name, e in list(zip(named, [*good, *bad], strict=True))[:shown]
+        }
+        more = {"more": f"{len(entries) - shown} more, on the page"} if shown < len(entries) else {}
+        most = None if verbose or shown <= 1 else MOST_LINES
+        if emit_summary(f"part: {_headline(seams, good)}", about | rows | more | last, most=most):
+            break
     if verbose:
         typer.echo(f"{'id':>4}  {'kind':8}  {'length mm':>9}  {'angle deg':>9}  {'radius mm':>9}  start -> end, mm")
         for edge in candidates(shape):
             length, angle, radius = _figures(edge)
-            ends = " -> ".join(
-                "({:.1f}, {:.1f}, {:.1f})".format(*(1e3 * p)) for p in (edge.points_P[0], edge.points_P[-1])
-            )
+            ends = " -> ".join("({:.1f}, {:.1f}, {:.1f})".format(*(1e3 * p)) for p in edge.points_P[[0, -1]])
             typer.echo(f"{edge.id:>4}  {edge.kind:8}  {length:>9}  {angle:>9}  {radius:>9}  {ends}")
-    size = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(shape.mesh.vertices, axis=0))
-    about = {"part": f"{shape.name}: {size} mm, {shape.bodies} bod{'ies' if shape.bodies > 1 else 'y'}"}
-    hints = {f"note {k}".strip(): hint for k, hint in enumerate((outside_hint(shape), unit_hint(shape)), 1) if hint}
-    entries = page_rows(shape, seams)
-    good, bad = ([e for e in entries if (e["state"] != "no") == wanted] for wanted in (True, False))
-    asks = "" if following or not good else typed("part", file)
-    last = {"next": following or asks, "page": f"{folder / PAGE} (-v lists every edge and refusal)"}
-    for shown in range(len(entries), 0, -1):
-        rows = dict[str, str]()
-        for k, entry in enumerate([*good, *bad][:shown]):
-            words = f"{entry['named']}: {entry['type']}, {entry['length']} mm, {entry['angle']} deg. {entry['verdict']}"
-            rows[f"seam {k + 1}" if entry["state"] != "no" else f"not {k + 1 - len(good)}"] = words
-        rest = len(entries) - shown
-        more = {"more": f"{rest} more, on the page"} if rest else {}
-        most = None if verbose or shown == 1 else MOST_LINES
-        if emit_summary(f"part: {_headline(seams, good)}", about | rows | more | hints | last, most=most):
-            return
-    emit_text(f"part: {_headline(seams, good)}")
-    emit_summary("", about | hints | last)
 
 
 def _headline(seams: list[Seam], good: list[dict[str, Any]]) -> str:
@@ -184,11 +178,10 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path, make: Callable
     ]
     write_atomic(folder / "edges.csv", csv_text(COLUMNS, table))
     entries = page_rows(shape, seams, make)
-    good = [entry for entry in entries if entry["state"] != "no"]
     page = {
         "title": shape.name,
         "size": " × ".join(f"{1e3 * v:.1f}" for v in np.ptp(shape.mesh.vertices, axis=0)),
-        "headline": _headline(seams, good),
+        "headline": _headline(seams, [entry for entry in entries if entry["state"] != "no"]),
         "scene": _scene(shape, entries),
     }
     write_atomic(folder / PAGE, render("part_3d.html.j2", page=page))

@@ -278,15 +278,19 @@ def _refusals(
     """
     found = dict[int, tuple[float, str]]()
     for number, part in enumerate(seams):
-        config = servo_config(scenario, station, number)
-        planning = dc.replace(
-            seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
-        )
-        plan = plan_drawn_seam(planning, 0)
-        if plan.reason is not None:
-            found[number] = 0.0, plan.reason
-        elif reason := _at_the_table(planning, part, plan):
-            found[number] = 0.5, reason  # nearer to a weld than where the arm has no way
+        try:
+            config = servo_config(scenario, station, number)
+            planning = dc.replace(
+                seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
+            )
+            plan = plan_drawn_seam(planning, 0)
+        except WeldcalError as error:  # no joint for this tool
+            found[number] = 0.0, str(error)
+        else:
+            if plan.reason is not None:
+                found[number] = 0.0, plan.reason
+            elif reason := _at_the_table(planning, part, plan):
+                found[number] = 0.5, reason  # nearer to a weld than where the arm has no way
         if found and not every:
             return found | dict.fromkeys(range(number, len(seams)), found[number])
     return found

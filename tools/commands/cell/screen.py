@@ -113,8 +113,8 @@ def side_of(edge: PartEdge) -> str:
     """Return the side of the part on which a joint opens, along an axis of its file, as "-y"; "" of an edge of none."""
     if edge.up_P is None:
         return ""
-    across = np.abs(edge.up_P[:2]) > OPEN_ABOVE
-    k = int(np.argmax(np.abs(edge.up_P[:2]))) if across.any() else 2
+    k = int(np.argmax(np.abs(edge.up_P[:2])))
+    k = k if abs(edge.up_P[k]) > OPEN_ABOVE else 2
     return ("+" if edge.up_P[k] > 0.0 else "-") + "xyz"[k]
 
 

@@ -86,10 +86,9 @@ def tool_check(
         picture = tool_picture(loaded)
         write_atomic(folder / "tool.png", picture)
         write_atomic(folder / "tool.html", tool_report(check, picture))
-        page = f"{folder / 'tool.html'} (-v prints every figure here)"
         rows = check.rows() if call.verbose else {key: check.rows()[key] for key in ("torch", "tip", "least pipe")}
         made, again = typed("new my_cell --tool-file", file), f"Correct {file}, then:\n{typed('tool check', file)}"
-        last = {"next": again if check.contradictions else made, "page": page}
+        last = {"next": again if check.contradictions else made, "page": f"{folder / 'tool.html'} (-v prints all here)"}
         told = {f"note {k + 1}": text for k, text in enumerate(check.contradictions)} | rows | last
         return Outcome(check.summary(), text=partial(emit_summary, f"tool check: {check.verdict}", told))
     if calibration is None:
@@ -227,8 +226,8 @@ class MeasureReport:
             rows[m.part] = f"{said} {1e3 * m.distance_m:.2f} +- {1e3 * m.margin_m:.2f} mm{turn}"
         if not np.isnan(f.stick_out_m) and f.wire is not None:
             rows["stick-out"] = f"{1e3 * f.stick_out_m:.1f} +- {2e3 * f.stick_out_sigma_m:.1f} mm"
-        point = "({:.2f}, {:.2f}, {:.2f}) mm".format(*_mm(f.p_FW))
-        rows["wire point"] = point if f.wire is not None else "not measured: the wire was not touched"
+        point = "not measured: the wire was not touched" if f.wire is None else "({:.2f}, {:.2f}, {:.2f}) mm"
+        rows["wire point"] = point.format(*_mm(f.p_FW))
         if every:
             rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
             rows |= {f"note {k + 1}": note for k, note in enumerate(f.notes)}
@@ -264,19 +263,19 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
         ring=ring,
         notes=notes,
     )
-    verdict = judge_tool(found, 1e-3 * welding.tolerance_mm)
     following = typed("tool check", folder / "tool.yaml")
     if found.wire is None:
         again = f"{typed('tool measure', order.dataset)} --calibration {shlex.quote(str(order.calibration))}"
         again += f" --tool {shlex.quote(str(order.tool))} --touches wire_touches.csv"
         following = f"Touch one point with the wire's end in twelve orientations: wire_touches.csv. Then:\n{again}"
+    verdict = judge_tool(found, 1e-3 * welding.tolerance_mm)
     report = MeasureReport(found, verdict, welding.tolerance_mm, folder, following)
     tell("writing", 0.9)
     write_atomic(folder / "tool.yaml", tool_text(found, measured_file(found), str(order.dataset)))
     picture = tool_picture(load_tool(folder / "tool.yaml"))
     write_atomic(folder / "tool.png", picture)
     tone: Mapping[str, str] = {HOLDS: "good", EXCEEDED: "bad"}
-    tolerance = report.verdict.tolerance
+    tolerance = verdict.tolerance
     page = render(
         "tool_measurement.html.j2",
         name=loaded.name,
