@@ -295,7 +295,7 @@ def test_the_printed_command_and_the_copied_lines_work(
 def test_bodies_have_the_names_of_the_file(step: Path, tmp_path: Path) -> None:
     text = step.read_text()
     for k, name in ((1, "base plate"), (2, "web")):
-        text = re.sub(rf"PRODUCT\('Open CASCADE STEP translator [\d.]+ 1\.{k}'", f"PRODUCT('{name}'", text)
+        text = re.sub(rf"'Open CASCADE STEP translator [\d.]+ \d+\.{k}'", f"'{name}'", text)
     (tmp_path / "named.step").write_text(text)
     assert {joint.bodies for joint in read_shape(step).joints} == {()}
     assert {joint.bodies for joint in read_shape(tmp_path / "named.step").joints} == {("base plate", "web")}
@@ -312,7 +312,8 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
     ]
     write_step(assembly(*plates), tmp_path / "mitre.step")
     words = ["part", str(tmp_path / "mitre.step"), "--plan", "0", "--out", str(tmp_path / "out")]
-    assert "is not listed and cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
+    shown = " ".join(CliRunner().invoke(app, words).stdout.split())
+    assert "is not listed and cannot be welded: weld its inside." in shown
     shape = read_shape(tmp_path / "mitre.step")
     outside = next(edge.id for edge in shape.edges if np.abs(edge.points_P[:, 1:]).max() < 1e-9)
     with pytest.raises(InputError, match=r"opens 270 deg, .* cannot be welded: weld its inside\."):

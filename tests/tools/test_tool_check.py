@@ -83,7 +83,7 @@ def test_a_tool_that_contradicts_its_drawing_is_named(name: str, tmp_path: Path)
     (tmp_path / "mine.yaml").write_text(text.replace(wrote, writes))
     words = ["tool", "check", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "out")]
     shown = " ".join(CliRunner().invoke(app, words).stdout.split())
-    assert "tool check: use with care: mine.yaml contradicts its drawing" in shown
+    assert "tool check: use with care: a statement in mine.yaml contradicts its drawing" in shown
     assert says in shown
     told = json.loads(CliRunner().invoke(app, [*words, "--overwrite", "--json"]).stdout.splitlines()[-1])
     assert told["verdict"] == "use with care"

@@ -152,9 +152,8 @@ class ToolCheck:
     @property
     def verdict(self) -> str:
         """The verdict and its reason, as a sentence."""
-        if not self.contradictions:
-            return f"{USE}: nothing in {self.loaded.file.name} contradicts its drawing"
-        return f"{CARE}: {self.loaded.file.name} contradicts its drawing"
+        words = f"in {self.loaded.file.name} contradicts its drawing"
+        return f"{CARE}: a statement {words}" if self.contradictions else f"{USE}: nothing {words}"
 
     def rows(self) -> dict[str, str]:
         """What was understood, in lines."""

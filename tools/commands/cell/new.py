@@ -220,9 +220,10 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     note = ""
     if part is not None:
         assert scenario.workpiece is not None
-        shape, begun = read_shape(part.file, part.units), scenario.workpiece
+        shape, begun, refused = read_shape(part.file, part.units), scenario.workpiece, dict[int, str]()
         for ids in chains:
-            offers, refused = offered(unfinished, scenario, shape, ids, part.joint)
+            offers, why = offered(unfinished, scenario, shape, ids, part.joint)
+            refused |= why
             if offers:
                 break
         if not offers:

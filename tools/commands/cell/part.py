@@ -73,8 +73,9 @@ def part(
     write_part(shape, seams, folder, make)
     summary = {**as_json(shape, folder), "seams": [seam.as_row() for seam in seams]}
     first = next((offer for seam in seams for offer in seam.offers), None)
-    summary["next"] = "" if first is None else make(first)
-    return Outcome(summary, text=partial(emit_table, shape, seams, folder, summary["next"], file, call.verbose))
+    following = "" if first is None else make(first)
+    shown = partial(emit_table, shape, seams, folder, following, file, call.verbose)
+    return Outcome({**summary, "next": following}, text=shown)
 
 
 def with_plans(
@@ -133,8 +134,10 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path, following: str
     last = {"note": outside_hint(shape), "unit": unit_hint(shape)}
     entries = page_rows(shape, seams)
     good, bad = ([e for e in entries if (e["state"] != "no") == wanted] for wanted in (True, False))
-    asks = "" if following or not good else typed("part", file)
-    last |= {"next": following or asks, "page": f"{folder / PAGE} (-v lists every edge and refusal)"}
+    last |= {
+        "next": following or (typed("part", file) if good else ""),
+        "page": f"{folder / PAGE} (-v lists every edge and refusal)",
+    }
     for shown in range(len(entries), -1, -1):
         named = [f"seam {k + 1}" for k in range(len(good))] + [f"not {k + 1}" for k in range(len(bad))]
         rows = {

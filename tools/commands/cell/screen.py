@@ -132,7 +132,7 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     return sorted(found, key=_order)
 
 
-def _order(seam: Seam) -> tuple[object, ...]:
+def _order(seam: Seam) -> tuple[Any, ...]:
     above = seam.joint.up_P[2] > OPEN_ABOVE
     return (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above, seam.short_m, -seam.joint.length_m)
 
@@ -287,7 +287,7 @@ def by_reason(refused: Mapping[int, str]) -> list[tuple[list[int], str]]:
     return [(ids, why) for why, ids in found.items()]
 
 
-def edges_text(ids: Sequence[int]) -> str:
+def edges_text(ids: Sequence[object]) -> str:
     """Name edges: "edge 5", "edges 5, 6"."""
     return f"edge{'s' * (len(ids) > 1)} {', '.join(map(str, ids))}"
 
