@@ -117,8 +117,6 @@ class ToolCheck:
         """What of the file contradicts its own bodies: a body that nothing carries, a wire point beside the torch."""
         t, found = self.loaded.tool, list[str]()
         bodies = [(s.name, _shape_points(s)) for s in t.drawn()]
-        if not bodies:
-            return ["No body is drawn, so the file cannot be compared with itself: add shapes."]
         rim = np.column_stack([circle(FLANGE_M, _SEGMENTS), np.zeros(_SEGMENTS)])
         carried, loose = [np.vstack([rim, rim - [0.0, 0.0, FLANGE_M]])], bodies
         while near := [b for b in loose if min(apart_m(b[1], c) for c in carried) <= GAP_M]:
@@ -131,7 +129,9 @@ class ToolCheck:
                 " is between."
             )
         back = LONGEST_M if t.stick_out_m is None else t.stick_out_m
-        off, name = min((self._off_torch(self.loaded.p_FW, points, back), name) for name, points in bodies)
+        off, name = min(
+            [(self._off_torch(self.loaded.p_FW, points, back), name) for name, points in bodies] or [(0, "")]
+        )
         if off > t.nozzle_radius_m:
             said = f"The wire point is not at a torch: {1e3 * back:.0f} mm up its wire the nearest body, {name}, is"
             found.append(f"{said} {1e3 * off:.0f} mm away. {self._other_sign(bodies, back)}")

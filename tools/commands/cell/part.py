@@ -134,10 +134,7 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path, following: str
     last = {"note": outside_hint(shape), "unit": unit_hint(shape)}
     entries = page_rows(shape, seams)
     good, bad = ([e for e in entries if (e["state"] != "no") == wanted] for wanted in (True, False))
-    last |= {
-        "next": following or (typed("part", file) if good else ""),
-        "page": f"{folder / PAGE} (-v lists every edge and refusal)",
-    }
+    last |= {"next": following or (typed("part", file) if good else ""), "page": f"{folder / PAGE} (-v: every edge)"}
     for shown in range(len(entries), -1, -1):
         named = [f"seam {k + 1}" for k in range(len(good))] + [f"not {k + 1}" for k in range(len(bad))]
         rows = {
