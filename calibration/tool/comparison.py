@@ -17,7 +17,7 @@ from weldcal.calibration.tool.measure import Move, ToolMeasurement
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 
-HOLDS, UNSURE, EXCEEDED = "holds", "may not hold", "does not hold"
+HOLDS, UNSURE, EXCEEDED, UNKNOWN = "holds", "may not hold", "does not hold", "is not known"
 _ON_AXIS_M, _ON_AXIS_COS = 2e-3, 0.9998  # a choice: a body is the torch's own where its middle line is the wire's
 _ALIKE_M = 5e-4  # a choice: shifts of ring and nozzle that differ by less are one shift
 _DIGITS = 4  # of millimetres, and of directions two more
@@ -38,12 +38,18 @@ def judge_tool(found: ToolMeasurement, tolerance_m: float) -> ToolVerdict:
     assert shift is not None
     most, least = shift.distance_m + shift.margin_m, shift.distance_m - shift.margin_m
     tolerance = HOLDS if most <= tolerance_m else EXCEEDED if least > tolerance_m else UNSURE
-    what = "The wire point" if shift.part == "wire" else "The nozzle's axis at the wire point"
-    moved = (
-        f"{what} is {1e3 * shift.distance_m:.2f} mm from its place in the tool file, +- {1e3 * shift.margin_m:.2f} mm"
-        f" at 95 %. The seam tolerance of {1e3 * tolerance_m:g} mm {tolerance}."
+    limit = f"the seam tolerance of {1e3 * tolerance_m:g} mm"
+    about = (
+        f"{1e3 * shift.distance_m:.2f} mm from its place in the tool file, +- {1e3 * shift.margin_m:.2f} mm at 95 %."
     )
-    return ToolVerdict(tolerance, moved, _cause(found))
+    if shift.part == "wire":
+        return ToolVerdict(tolerance, f"The wire point is {about} {limit.capitalize()} {tolerance}.", _cause(found))
+    place = "The nozzle has moved" if shift.moved else "The nozzle is in place"
+    if tolerance == EXCEEDED:
+        judged = f"The wire was not touched; were it straight, {limit} {tolerance}."
+    else:
+        tolerance, judged = UNKNOWN, f"The wire was not touched: whether {limit} holds is not known."
+    return ToolVerdict(tolerance, f"{place}: its axis is {about} {judged}", _cause(found))
 
 
 def _cause(found: ToolMeasurement) -> str:
@@ -134,9 +140,10 @@ def measured_file(found: ToolMeasurement) -> dict[str, Any]:
 
 def tool_text(found: ToolMeasurement, document: dict[str, Any], source: str) -> str:
     """Return the new tool file, with what was measured in its first lines."""
+    what = "nozzle's axis, the wire not touched," if found.wire is None else "wire point"
     head = (
         f"# '{found.tool.file.name}' with its torch as measured from {Path(source).name}:"
-        f" wire point +- {1e3 * wire_sigma(found):.3f} mm at 95 %.\n"
+        f" {what} +- {1e3 * wire_sigma(found):.3f} mm at 95 %.\n"
     )
     return head + str(yaml_dump(document))
 

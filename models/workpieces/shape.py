@@ -60,6 +60,7 @@ class PartJoint:
     up_P      (3,) unit, out of the joint, in the middle of its longest edge
     side      left or right of a web, inside or outside of a corner; else ""
     closed    it ends where it begins
+    bodies    names of the two bodies in the file, as far as it has them
     """
 
     type: str
@@ -71,6 +72,7 @@ class PartJoint:
     up_P: Floats
     side: str = ""
     closed: bool = False
+    bodies: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ _EXTERNAL = re.compile(
     rb"DOCUMENT_FILE\s*\(\s*'([^']*\.st(?:e?p))'", re.IGNORECASE
 )  # ISO 10303-44: parts in files of their own
 _STRINGS, _HELD, _NAMED = re.compile(rb"'(?:[^']|'')*'"), re.compile(rb"#(\d+)\s*="), re.compile(rb"#(\d+)")
+_UNNAMED = "Open CASCADE STEP translator"  # its name for a body without one
 _UNIT_NAMES = {"MILLIMETRE": "mm", "MILLIMETER": "mm", "METRE": "m", "METER": "m", "INCH": "inch"}
 
 
@@ -42,13 +44,13 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
     file_size(path, LARGEST_STEP)
     for file in (path, *referenced(path)):
         _check_text(file)
-    shape, unit = _transferred(path)
+    shape, unit, names = _transferred(path)
     from weldcal.models.workpieces.joints import joints_of
 
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
-    edges, joints = with_joints(_edges(shape), joints_of(shape))
+    edges, joints = with_joints(_edges(shape), joints_of(shape), names)
     return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
 
 
@@ -99,8 +101,11 @@ def _check_text(path: Path) -> None:
         )
 
 
-def _transferred(path: Path) -> tuple[Any, str | None]:
-    """Return the TopoDS_Shape in millimetres and the file's length unit (None where it is another than mm, m, inch)."""
+def _transferred(path: Path) -> tuple[Any, str | None, list[str]]:
+    """Return the TopoDS_Shape in millimetres, the file's length unit and the names of its solids.
+
+    The unit is None where it is another than mm, m, inch.
+    """
     try:
         from OCP.collections import Sequence_TCollection_AsciiString
         from OCP.IFSelect import IFSelect_ReturnStatus
@@ -132,7 +137,25 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
     known = {_UNIT_NAMES[name] for name in names if name in _UNIT_NAMES}
     if len(known) > 1:
         raise InputError(f"'{path.name}' mixes the units {', '.join(sorted(known))}: export it in one unit.")
-    return shape, next(iter(known), None)
+    return shape, next(iter(known), None), _names(reader, shape)
+
+
+def _names(reader: Any, shape: Any) -> list[str]:
+    """Return the names of the solids: of their products in an assembly, else their own; "" where there is none."""
+    from OCP.StepRepr import StepRepr_NextAssemblyUsageOccurrence
+    from OCP.TopAbs import TopAbs_ShapeEnum
+
+    from weldcal.models.workpieces.brep import parts_of
+
+    found, made = list[str](), reader.WS().TransferReader()
+    for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID):
+        entity = made.EntityFromShapeResult(solid, 1)  # None of a body in another file
+        if isinstance(entity, StepRepr_NextAssemblyUsageOccurrence):
+            entity = entity.RelatedProductDefinition().Formation().OfProduct()
+        name = getattr(entity, "Name", lambda: None)()
+        words = "" if name is None else name.ToCString().strip()
+        found.append("" if words.startswith(_UNNAMED) else words)
+    return found
 
 
 def _assembled(path: Path) -> Any:
@@ -226,9 +249,12 @@ def _met(curve: Any, edge: Any, first: SolidFace, second: SolidFace) -> tuple[st
 
 
 def with_joints(
-    edges: tuple[PartEdge, ...], chains: list[list[Piece]]
+    edges: tuple[PartEdge, ...], chains: list[list[Piece]], names: Sequence[str] = ()
 ) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
-    """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
+    """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints.
+
+    names: of the bodies.
+    """
     from weldcal.models.workpieces.brep import length_of
     from weldcal.models.workpieces.joints import closes
 
@@ -255,6 +281,7 @@ def with_joints(
                 up_P=longest.up,
                 side=longest.side,
                 closed=closes(chain),
+                bodies=tuple(dict.fromkeys(names[k] for k in longest.bodies if k < len(names) and names[k])),
             )
         )
     return tuple(known), tuple(joints)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import math
 import re
-from itertools import combinations
+import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
-from mpl_toolkits.mplot3d import proj3d
 from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
@@ -20,14 +18,15 @@ from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.shape import PartJoint
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.parts import part_of
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell import new
-from weldcal.tools.commands.cell.new import OwnPart, write_cell
-from weldcal.tools.commands.cell.part import edges_picture, with_plans
-from weldcal.tools.commands.cell.screen import Seam, ranked, ways
+from weldcal.tools.commands.cell.new import OwnPart, planned, write_cell
+from weldcal.tools.commands.cell.part import with_plans
+from weldcal.tools.commands.cell.screen import Seam, followed, ranked, unfit, ways
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, prism, write_step
 
 
@@ -54,23 +53,33 @@ def test_the_json_lists_every_edge(step: Path, tmp_path: Path) -> None:
         assert edge["angle_deg"] == pytest.approx(90.0, abs=1e-6)
         assert edge["radius_mm"] is None
         assert {round(edge["start"][0], 3), round(edge["end"][0], 3)} == {-90.0, 90.0}
-    assert (tmp_path / "edges.png").stat().st_size > 20_000
-    page = (tmp_path / "report.html").read_text()
-    assert "2 concave edges" in page
     assert len((tmp_path / "edges.csv").read_text().splitlines()) == 25
     page = (tmp_path / "seams.html").read_text()
+    assert found["report"] == str(tmp_path / "seams.html")
     assert "http" not in page.replace("http-equiv", "")  # one file, no network
-    scene = json.loads(re.search(r"const \{ vertices, triangles, seams \} = (.*);", page)[1])  # type: ignore[index]
+    scene = scene_of(tmp_path)
     assert len(scene["triangles"]) == 24
     assert [seam["edges"] for seam in scene["seams"]] == [row["edges"] for row in found["seams"]]
+    assert {seam["state"] for seam in scene["seams"]} == {"fits"}  # the arm was not asked: no line to copy
+    assert {seam["text"] for seam in scene["seams"]} == {""}
     ends = {tuple(point) for seam in scene["seams"] for line in seam["lines"] for point in line}
     assert len(ends) == 4
     assert {abs(x) for x, _, _ in ends} == {90.0}
 
 
-def test_the_table_puts_the_concave_edges_first(step: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["part", str(step), "--plan", "0", "--out", str(tmp_path)])
-    rows = [line.split() for line in result.stdout.splitlines()[2:]]
+def scene_of(folder: Path) -> dict[str, Any]:
+    """What seams.html draws."""
+    text = re.search(r"const \{ vertices, triangles, seams \} = (.*);", (folder / "seams.html").read_text())
+    assert text is not None
+    return dict(json.loads(text[1]))
+
+
+def test_only_verbose_lists_the_edges_joints_first(step: Path, tmp_path: Path) -> None:
+    words = ["part", str(step), "--plan", "0", "--out", str(tmp_path / "out")]
+    assert "convex" not in CliRunner().invoke(app, words).stdout
+    result = CliRunner().invoke(app, [*words, "-v", "--overwrite"])
+    assert result.stdout.startswith("part: the tool fits 2 seams")
+    rows = [line.split() for line in result.stdout.partition("start -> end, mm\n")[2].splitlines()]
     assert [row[1] for row in rows[:3]] == ["concave", "concave", "convex"]
     assert rows[0][2:4] == ["180.00", "90.0"]
 
@@ -108,8 +117,8 @@ def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
         .invoke(app, ["part", str(tmp_path / "pipe.step"), "--plan", "0", "--out", str(tmp_path / "text")])
         .stdout
     )
-    assert re.search(r"pipe on plate +502\.7 +90\.0 .*  fits the tool, not planned", text)
-    assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
+    assert "pipe on plate, 502.7 mm, 90 deg. Fits the tool, not planned" in " ".join(text.split())
+    assert f"weldcal part {tmp_path / 'pipe.step'}" in text  # the next step asks the arm
 
 
 def test_the_planner_refuses_in_part_what_it_refuses_in_new(tmp_path: Path) -> None:
@@ -138,40 +147,84 @@ def test_a_seam_with_corners_is_taken_as_a_whole(tmp_path: Path) -> None:
     assert [seam.edges for seam in seams] == [list(joint.edges)]
 
 
-def test_where_the_whole_is_refused_a_piece_is_taken_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), box((-50, -35, 0), (100, 70, 40))), tmp_path / "p.step")
-    (joint,) = read_shape(tmp_path / "p.step").joints
-
-    def only_alone(scenario: Scenario, *_: object) -> str:
-        return "Too near." if len(scenario.workpiece.seams[0].edges) > 1 else ""  # type: ignore[union-attr]
-
-    monkeypatch.setattr(new, "add_scan_poses", only_alone)
-    monkeypatch.setattr(new, "weldable_place", lambda scenario, advises: (scenario.workpiece.pose_guess, ""))
-    path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
-    (seam,) = load_scenario(str(path)).workpiece.seams  # type: ignore[union-attr]
-    assert seam.edges[0] in joint.edges
-    assert note == f"Only edge {seam.edges[0]} of {', '.join(map(str, joint.edges))}. As a whole: Too near."
-    assert "# Only edge" in path.read_text()
-    # Of edges that an operator gives nothing is left out.
-    path, reason = write_cell(tmp_path / "by_hand", "s_groove", OwnPart(tmp_path / "p.step", joint.edges))
-    assert (path.name, reason) == ("unfinished.yaml", "Too near.")
+LINES = re.compile(r"^  seams: .*\n  joint: .*$", re.MULTILINE)
+"""The lines of cell.yaml over which those of the page are pasted."""
 
 
-def test_pieces_are_named_with_the_reason_of_their_own_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two webs the longer is tried first, and refused in any way."""
-    webs = box((-60, -90, 0), (120, 6, 40)), box((-40, 90, 0), (80, 6, 40))
-    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), *webs), tmp_path / "p.step")
-    _, second = sorted(read_shape(tmp_path / "p.step").joints, key=lambda joint: -joint.length_m)
+def ordered(cell: str) -> str:
+    """The two lines of a cell.yaml that name its seams, without their comments."""
+    (found,) = LINES.findall(cell)
+    return "\n".join(line.split("  #")[0] for line in found.splitlines())
 
-    def only_the_second_in_pieces(scenario: Scenario, *_: object) -> str:
-        ids = scenario.workpiece.seams[0].edges  # type: ignore[union-attr]
-        return f"Whole {min(ids)}." if len(ids) > 1 else "" if ids[0] in second.edges else "A piece."
 
-    monkeypatch.setattr(new, "add_scan_poses", only_the_second_in_pieces)
-    monkeypatch.setattr(new, "weldable_place", lambda scenario, advises: (scenario.workpiece.pose_guess, ""))
-    _, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
-    assert re.match(r"Without edges \d+, \d+, which are shorter", note)
-    assert note.endswith(f"As a whole: Whole {min(second.edges)}.")
+def a_post(folder: Path) -> tuple[Path, PartJoint]:
+    """A post on a plate, and the one joint around it: four edges."""
+    path = folder / "p.step"
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), box((-50, -35, 0), (100, 70, 40))), path)
+    (joint,) = read_shape(path).joints
+    return path, joint
+
+
+def answers(monkeypatch: pytest.MonkeyPatch, poses: list[set[int]]) -> None:
+    """Let the arm weld in each pose of the part only some edges, each alone."""
+
+    def places(scenario: Scenario, apart: bool = False, advises: bool = False) -> object:
+        asked = scenario.workpiece.seams  # type: ignore[union-attr]
+        alone = {seam.edges[0]: k for k, seam in enumerate(asked) if len(seam.edges) == 1}
+        found = [
+            (PoseConfig([0.65, 0.0, z], [0.0] * 3), [alone[id] for id in alone if id in some])
+            for z, some in enumerate(poses)
+        ]
+        welded = {k for _, some in found for k in some}
+        if not apart and len(welded) < len(asked):
+            return [], dict.fromkeys(range(len(asked)), "Too near.")
+        return [at for at in found if at[1]], {k: f"Wall {k}." for k in range(len(asked)) if k not in welded}
+
+    monkeypatch.setattr(new, "weldable_places", places)
+    monkeypatch.setattr(new, "add_scan_poses", lambda scenario, path, reason: reason)
+
+
+def test_an_edge_that_is_refused_is_named_and_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, joint = a_post(tmp_path)
+    blocked, *rest = joint.edges
+    answers(monkeypatch, [set(rest)])
+    for given in ((), joint.edges):
+        path, note = write_cell(tmp_path / f"cell{len(given)}", "s_groove", OwnPart(file, given))
+        seams = load_scenario(str(path)).workpiece.seams  # type: ignore[union-attr]
+        assert [seam.edges for seam in seams] == [[id] for id in rest]
+        assert note == f"Without edge {blocked}: Wall 0."
+        assert f"# {note}" in path.read_text()
+
+
+def test_sides_of_a_post_in_two_poses_are_two_offers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, joint = a_post(tmp_path)
+    a, b, c, d = joint.edges
+    answers(monkeypatch, [{a, b}, {c}])
+    ((offers, refused),) = planned(OwnPart(file), [joint.edges], WELDING, lambda stage, share: None)
+    assert [offer.edges for offer in offers] == [[a, b], [c]]
+    assert [offer.pose.xyz_m[2] for offer in offers] == [0.0, 1.0]
+    assert refused == {d: "Wall 3."}
+    assert offers[0].note == f"Without edge {c}: in another pose of the part. Without edge {d}: Wall 3."
+    # What `new` makes of each offer's edges is the offer.
+    for offer in offers:
+        cell, _ = write_cell(tmp_path / str(offer.edges[0]), "s_groove", OwnPart(file, tuple(offer.edges)))
+        assert ordered(cell.read_text()) == offer.lines
+
+
+def test_a_refusal_names_each_edge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, joint = a_post(tmp_path)
+    answers(monkeypatch, [set()])
+    path, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(file))
+    assert path.name == "unfinished.yaml"
+    assert [f"Edge {id}: Wall {k}." in reason for k, id in enumerate(joint.edges)] == [True] * 4
+
+
+def test_edges_that_do_not_follow_are_several_seams(tmp_path: Path) -> None:
+    file, joint = a_post(tmp_path)
+    a, b, c, d = joint.edges
+    assert followed(read_shape(file), [a, b, d]) == [[d, a, b]] or followed(read_shape(file), [a, c]) == [[a], [c]]
+    with pytest.raises(InputError, match="has no edge 999"):
+        followed(read_shape(file), [a, 999])
 
 
 def test_the_edge_below_a_tube_is_left_out(tmp_path: Path) -> None:
@@ -181,9 +234,74 @@ def test_the_edge_below_a_tube_is_left_out(tmp_path: Path) -> None:
     shape = read_shape(tmp_path / "tubes.step")
     ring = max(shape.joints, key=lambda joint: joint.length_m)
     (below,) = (id for id in ring.edges if np.abs(shape.edge(id).points_P[:, 2]).max() < 1e-6)
-    (_, _), (pieces, note), *_ = ways(shape, ring.edges)
+    _, (pieces, _, apart) = ways(shape, ring.edges)
+    assert apart
     assert [seam.edges for seam in pieces] == [[id] for id in ring.edges if id != below]
-    assert note == f"Without edges {below}, which are shorter than 20 mm or open downwards."
+    assert unfit(shape.edge(below)) == "open downwards as drawn, where no arm reaches."
+
+
+def gusset() -> Any:
+    return assembly(box((-150, -100, -10), (300, 200, 10)), box((-70, -4, 0), (140, 8, 70)))
+
+
+def channel() -> Any:
+    """A U-channel, open below, with a cap at its end: seven edges around it, of which an arm reaches few."""
+    bent = less(box((0, 0, 0), (200, 80, 60)), box((-1, 8, -1), (202, 64, 53)))
+    return assembly(bent, box((200, -20, 0), (10, 120, 100)))
+
+
+MADE = {
+    "gusset": gusset,
+    "channel": channel,
+    "tube": lambda: assembly(
+        box((-150, -150, -10), (300, 300, 10)), less(cylinder((0, 0, 0), 84, 50), cylinder((0, 0, -1), 76, 60))
+    ),
+    "lap": lambda: assembly(box((0, 0, -6), (220, 120, 6)), box((10, 40, 0), (200, 70, 6))),
+    "butt": lambda: assembly(box((0, 0, -6), (220, 60, 6)), box((0, 61.5, -6), (220, 60, 6))),
+    "two solids": lambda: PARTS["two_solids"]().shape,
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_the_printed_command_and_the_copied_lines_work(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = f"{name}.step"
+    write_step(MADE[name](), tmp_path / file)
+    printed = CliRunner().invoke(app, ["part", file, "--plan", "1", "--out", "out"])
+    assert printed.exit_code == 0, printed.output
+    assert len(printed.stdout.splitlines()) <= 12
+    shown = [seam for seam in scene_of(tmp_path / "out")["seams"] if seam["state"] == "yes"]
+    (command,) = re.findall(r"weldcal new .*", printed.stdout)
+    assert command == shown[0]["command"]
+    made = CliRunner().invoke(app, shlex.split(command)[1:])
+    assert made.exit_code == 0, made.output
+    cell = Path("my_cell/cell.yaml")
+    text = cell.read_text()
+    assert ordered(text) == shown[0]["text"]  # `new` welds exactly what is offered
+    for seam in shown:
+        cell.write_text(LINES.sub(seam["text"], text))
+        spec = load_scenario(str(cell)).workpiece
+        assert spec is not None
+        assert {id for one in spec.seams for id in one.edges} == set(seam["edges"])
+        assert seam_count(part_of(spec)) >= len(spec.seams)
+    if name == "gusset":
+        _, one, _, other = read_shape(tmp_path / file).joints[0].edges
+        assert sorted(shown[0]["edges"]) == sorted((one, other))
+        assert re.search(r"seams: \[\{edges: \[\d+\]\}, \{edges: \[\d+\]\}\]", shown[0]["text"])
+
+
+def test_bodies_have_the_names_of_the_file(step: Path, tmp_path: Path) -> None:
+    text = step.read_text()
+    for k, name in ((1, "base plate"), (2, "web")):
+        text = re.sub(rf"'Open CASCADE STEP translator [\d.]+ \d+\.{k}'", f"'{name}'", text)
+    (tmp_path / "named.step").write_text(text)
+    assert {joint.bodies for joint in read_shape(step).joints} == {()}
+    assert {joint.bodies for joint in read_shape(tmp_path / "named.step").joints} == {("base plate", "web")}
+    words = ["part", str(tmp_path / "named.step"), "--plan", "0", "--out", str(tmp_path / "out")]
+    printed = " ".join(CliRunner().invoke(app, words).stdout.split())
+    assert "(+y): T left of base plate and web, 180.0 mm" in printed
 
 
 def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> None:
@@ -194,7 +312,8 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
     ]
     write_step(assembly(*plates), tmp_path / "mitre.step")
     words = ["part", str(tmp_path / "mitre.step"), "--plan", "0", "--out", str(tmp_path / "out")]
-    assert "is not listed and cannot be welded: weld its inside." in CliRunner().invoke(app, words).stdout
+    shown = " ".join(CliRunner().invoke(app, words).stdout.split())
+    assert "is not listed and cannot be welded: weld its inside." in shown
     shape = read_shape(tmp_path / "mitre.step")
     outside = next(edge.id for edge in shape.edges if np.abs(edge.points_P[:, 1:]).max() < 1e-9)
     with pytest.raises(InputError, match=r"opens 270 deg, .* cannot be welded: weld its inside\."):
@@ -203,13 +322,13 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
 
 def test_after_a_minute_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shape = read_shape(step)
-    monkeypatch.setattr(new, "_refused", lambda *_: "")
+    monkeypatch.setattr(new, "offered", lambda *_: ([], {1: "Too near."}))
     seams = ranked(shape, load_tool(WELDING).tool)
     for most, count in ((60.0, 2), (0.0, 1)):
         monkeypatch.setattr(new, "MOST_PLANNING_S", most)
         monkeypatch.setattr(new, "process_time", iter((0.0, 0.0, 1.0)).__next__)
         found = with_plans(shape, seams, 10, step, None, WELDING, lambda stage, share: None)
-        assert [seam.planned for seam in found] == [True] * count + [False] * (2 - count)
+        assert sorted(seam.planned for seam in found) == [False] * (2 - count) + [True] * count
 
 
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:
@@ -217,7 +336,7 @@ def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> Non
     pipe = less(cylinder((0, 0, 0), 100, 50), cylinder((0, 0, -1), 94, 60))
     write_step(assembly(box((-220, -220, -10), (440, 440, 10)), pipe), tmp_path / "pipe.step")
     path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "pipe.step"))
-    assert note.startswith("The ring 14 in two halves that overlap by 5 mm. As a whole: ")
+    assert note == "The ring 14 in two halves that overlap by 5 mm."
     assert path.name == "cell.yaml"
     part = part_of(load_scenario(str(path)).workpiece)  # type: ignore[arg-type]
     assert seam_count(part) == 2
@@ -246,9 +365,9 @@ def test_an_end_below_zero_belongs_to_a_ring(tmp_path: Path) -> None:
 def test_a_part_without_seams_says_so(tmp_path: Path) -> None:
     write_step(box((0, 0, 0), (100, 60, 10)), tmp_path / "plate.step")
     text = CliRunner().invoke(app, ["part", str(tmp_path / "plate.step"), "--out", str(tmp_path / "out")]).stdout
-    assert "No seams are listed: no two bodies meet" in text
-    assert "Pick by number" not in text
-    assert "Picture: " in text
+    assert "no seams: no two bodies meet" in text
+    assert "weldcal new" not in text
+    assert "seams.html" in text
 
 
 def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
@@ -282,30 +401,6 @@ def test_a_lap_of_thin_sheets_needs_the_small_ball(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, made)
     assert result.exit_code == 0, result.output
     assert "radius_mm: 1.0" in (cell / "tool.yaml").read_text()
-
-
-def test_the_numbers_in_the_picture_do_not_overlap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    ribs = [box((0, y, 0), (200, 3, 40)) for y in range(5, 200, 12)]
-    write_step(assembly(box((0, 0, -5), (200, 200, 5)), *ribs), tmp_path / "ribs.step")
-    figures: list[Figure] = []
-    kept = Figure.savefig
-
-    def save(self: Figure, *args: object, **kwargs: object) -> None:
-        figures.append(self)
-        kept(self, *args, **kwargs)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Figure, "savefig", save)
-    edges_picture(read_shape(tmp_path / "ribs.step"))
-    (figure,) = figures
-    for axes in figure.axes:
-        boxes = []
-        for text in axes.texts:
-            x, y, _ = proj3d.proj_transform(*text.get_position_3d(), axes.get_proj())
-            px, py = axes.transData.transform((x, y))
-            size = text.get_window_extent()
-            boxes.append(Bbox.from_bounds(px - size.width / 2, py - size.height / 2, size.width, size.height))
-        assert len(boxes) > 12
-        assert not [1 for a, b in combinations(boxes, 2) if a.overlaps(b)]
 
 
 def test_a_very_small_part_is_asked_whether_it_is_in_inches(tmp_path: Path) -> None:

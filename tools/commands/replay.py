@@ -163,7 +163,7 @@ def _run(
     return str(cell.job.command(root).phase), X_BC
 
 
-PAGES = ("report.html", "recording.html")
+PAGES = ("report.html", "recording.html", "seams.html", "tool.html")
 
 
 @command("view", common=LOOK, short_help="Show the report and the 3D recording of a finished run.")

@@ -15,12 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import flange_mesh
-from weldcal.models.mesh import TriMesh, revolve
+from weldcal.models.mesh import TriMesh, circle, revolve
 from weldcal.models.robots import ROBOTS
 from weldcal.models.tool import ToolShape
 from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.models.tools.loading import LoadedTool
 from weldcal.systems.drivers.simulated.rendered_finger_camera import TagView
+from weldcal.tools.report.first_screen import CARE, USE
 from weldcal.tools.report.pictures import subplots
 from weldcal.tools.report.render import render
 from weldcal.welding.servo.tool_axes import least_pipe_m
@@ -30,6 +31,9 @@ KEEP, AXIS = "#b04a3a", "#20262c"
 _SEGMENTS = 32
 NAMES_APART_MM = 9.0
 WALL_M = 0.1  # of pipe and plate beside the seam
+FLANGE_M = 0.0315  # radius of the flange: ISO 9409-1-50 has 63 mm
+GAP_M = 0.010  # a choice: a wider gap between bodies holds no washer or bracket that nobody draws
+LONGEST_M = 0.040  # from nozzle to wire point, where the file does not state it: twice a usual stick-out
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,8 @@ class ToolCheck:
         side_px = float(np.linalg.norm(self.tag_px[1] - self.tag_px[0]))
         return {
             "state": "done",
+            "verdict": USE if not self.contradictions else CARE,
+            "contradictions": self.contradictions,
             "name": self.loaded.name,
             "file": str(self.loaded.file),
             "mass_kg": t.mass_kg,
@@ -106,6 +112,49 @@ class ToolCheck:
         """Diameter of the least pipe whose outside the tool can weld onto a plate, both WALL_M wide beside the seam."""
         return round(1e3 * least_pipe_m(self.loaded.tool, WALL_M))
 
+    @cached_property
+    def contradictions(self) -> list[str]:
+        """What of the file contradicts its own bodies: a body that nothing carries, a wire point beside the torch."""
+        t, found = self.loaded.tool, list[str]()
+        bodies = [(s.name, _shape_points(s)) for s in t.drawn()]
+        rim = np.column_stack([circle(FLANGE_M, _SEGMENTS), np.zeros(_SEGMENTS)])
+        carried, loose = [np.vstack([rim, rim - [0.0, 0.0, FLANGE_M]])], bodies
+        while near := [b for b in loose if min(apart_m(b[1], c) for c in carried) <= GAP_M]:
+            carried, loose = [*carried, *(p for _, p in near)], [b for b in loose if b not in near]
+        if loose:
+            gap = 1e3 * min(apart_m(points, c) for _, points in loose for c in carried)
+            names = ("Body " if len(loose) == 1 else "Bodies ") + ", ".join(name for name, _ in loose)
+            found.append(
+                f"{names}: {gap:.0f} mm away from the flange and all that it carries. Correct xyz_mm, or draw what"
+                " is between."
+            )
+        back = LONGEST_M if t.stick_out_m is None else t.stick_out_m
+        off, name = min(
+            [(self._off_torch(self.loaded.p_FW, points, back), name) for name, points in bodies] or [(0, "")]
+        )
+        if off > t.nozzle_radius_m:
+            said = f"The wire point is not at a torch: {1e3 * back:.0f} mm up its wire the nearest body, {name}, is"
+            found.append(f"{said} {1e3 * off:.0f} mm away. {self._other_sign(bodies, back)}")
+        return found
+
+    def _off_torch(self, p_FW: Array, points: Array, back_m: float) -> float:
+        """Distance, m, at least, of the wire behind a wire point from a body's hull."""
+        return apart_m(points, np.array([p_FW, p_FW - back_m * self.loaded.torch_axis]))
+
+    def _other_sign(self, bodies: list[tuple[str, Array]], back_m: float) -> str:
+        for k in range(3):
+            other = self.loaded.p_FW * np.where(np.arange(3) == k, -1.0, 1.0)
+            at = [n for n, p in bodies if self._off_torch(other, p, back_m) <= self.loaded.tool.nozzle_radius_m]
+            if at:
+                return f"With the other sign of its {'xyz'[k]} it is at {at[-1]}: correct torch.xyz_mm."
+        return "Correct torch.xyz_mm or the body of the torch."
+
+    @property
+    def verdict(self) -> str:
+        """The verdict and its reason, as a sentence."""
+        words = f"in {self.loaded.file.name} contradicts its drawing"
+        return f"{CARE}: a statement {words}" if self.contradictions else f"{USE}: nothing {words}"
+
     def rows(self) -> dict[str, str]:
         """What was understood, in lines."""
         t, camera = self.loaded.tool, self.loaded.camera
@@ -131,7 +180,8 @@ class ToolCheck:
             ),
             "torch": (
                 f"wire point at {_text(self.loaded.p_FW)} mm, {1e3 * t.chord_m:.1f} mm behind the tip and "
-                f"{1e3 * t.torch_height_m:.1f} mm above it, {self.torch_to_finger_deg:.0f} deg from the finger"
+                f"{abs(1e3 * t.torch_height_m):.1f} mm {'above' if t.torch_height_m > 0.0 else 'below'} it, "
+                f"{self.torch_to_finger_deg:.0f} deg from the finger"
             ),
             "finger camera": (
                 f"{camera.width} x {camera.height} px, focal length {camera.focal_px:g} px, at "
@@ -144,6 +194,19 @@ class ToolCheck:
             "least pipe": f"{self.least_pipe_mm:g} mm across, welded onto a plate from outside",
             "bodies": f"{len(t.drawn())} drawn, {len(t.capsules())} capsules kept clear",
         }
+
+
+def apart_m(a: Array, b: Array) -> float:
+    """Return how far the hulls of two sets of points (N, 3) m are apart, at least; 0 or less where they may meet.
+
+    The widest gap along a normal of a face of either is taken: two hulls are apart by no less.
+    """
+    gaps = [-np.inf]
+    for body, other in ((a, b), (b, a)):
+        if len(body) > 3:
+            equations = ConvexHull(body).equations
+            gaps.append(float((other @ equations[:, :3].T + equations[:, 3]).min(axis=0).max()))
+    return max(gaps)
 
 
 def _mm(values: object) -> list[float]:
@@ -167,6 +230,9 @@ def tool_report(check: ToolCheck, picture: bytes) -> str:
     return render(
         "tool.html.j2",
         name=check.loaded.name,
+        tone="warn" if check.contradictions else "good",
+        headline=check.verdict[:1].upper() + check.verdict[1:],
+        notes=check.contradictions,
         file=check.loaded.file.name,
         rows=list(check.rows().items()),
         picture=picture,

@@ -4,46 +4,32 @@ import dataclasses as dc
 import json
 import shutil
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic
-from weldcal.models.mesh import TriMesh, extrude
-from weldcal.models.scanners import cast
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
-from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
-from weldcal.models.workpieces.shape import PartEdge, PartShape
+from weldcal.models.workpieces.shape import PartShape
 from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
-from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, plan_seam
-from weldcal.systems.jobs.weld.settings import servo_config
-from weldcal.systems.messages import PlannedSeam, Scan
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, SeamConfig, ToolFile, WorkpieceConfig
-from weldcal.systems.station import Station, make_station
+from weldcal.systems.scenario.schema import ErrorConfig, Scenario, ToolFile, WorkpieceConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.scan_poses import add_scan_poses
+from weldcal.tools.commands.cell.scan_poses import TURNS_DEG, add_scan_poses, standing, weldable_places
 from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
-from weldcal.tools.commands.cell.screen import MOST_TRIED, joint_of, least_pipe, to_try, unit_hint, ways
+from weldcal.tools.commands.cell.screen import Offer, joint_of, least_pipe, ranked, unfit, unit_hint, ways, without
 from weldcal.tools.report.first_screen import typed
-from weldcal.welding.seam.clearance import NoClearance, check_beside
 
 BASE = "s_groove"
 EXAMPLE = Path(__file__).parent / "example_scans"  # made by tests/documents/example_scans.py
@@ -93,12 +79,9 @@ HEAD = """# yaml-language-server: $schema={schema}
 #   weldcal check-cell {path}
 """
 TOOL = "tool.yaml"
-TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
-TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
+MOST_TRIED = 4  # seams of a part for which a place is looked for
 MOST_PLANNING_S = 60.0  # of processor time for the seams of a part: a choice, a user waits no longer
-TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
-PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
 RUNS = """# A cell of your own. It runs as it is, in simulation:
@@ -218,7 +201,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     if part is not None:
         scenario.description = f"A cell that welds {part.file.name}."
         fits = load_tool(WELDING if tool is None else tool).tool
-        candidates = add_part(scenario, folder, part, fits)
+        chains = add_part(scenario, folder, part, fits)
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
@@ -226,23 +209,19 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     note = ""
     if part is not None:
         assert scenario.workpiece is not None
-        standing, refusals = scenario.workpiece.pose_guess, dict[int, str]()  # by edge: why the seam along it is none
-        for seams, joint, pieces in candidates:
-            reason, note = _refused(unfinished, scenario, seams, joint, standing, False), pieces
-            if not reason:
+        shape, begun, refused = read_shape(part.file, part.units), scenario.workpiece, dict[int, str]()
+        for ids in chains:
+            offers, why = offered(unfinished, scenario, shape, ids, part.joint)
+            refused |= why
+            if offers:
                 break
-            refusals = dict.fromkeys(seams[0].edges, reason) | refusals
-        if reason:
-            (seams, joint, _), shape = candidates[0], read_shape(part.file, part.units)
-            nearest = _refused(unfinished, scenario, seams, joint, standing, True) or refusals[seams[0].edges[0]]
-            whole = sum(not note for *_, note in candidates)
-            several = f"None of {whole} seams can be welded; the nearest one: " if whole > 1 else ""
-            reason = _with_advice(shape, seams[0], fits, several + nearest)
-            scenario.workpiece = dc.replace(scenario.workpiece, seams=seams, joint=joint, pose_guess=standing)
+        if not offers:
+            reason = _with_advice(shape, unfinished, scenario, fits, len(chains), refused)
             _write(unfinished, scenario, CANNOT_WELD.format(reason=_comment(reason), path=unfinished))
             return unfinished, reason
-        if note:
-            note = f"{note} As a whole: {refusals[seams[0].edges[0]]}"
+        best, note = offers[0], offers[0].note
+        scenario.workpiece = dc.replace(begun, seams=best.seams, joint=best.joint, pose_guess=best.pose)
+        scenario.planning.scan_poses_deg = best.scan_poses_deg
         # The part is planned on the branch of home, and will not lie exactly as drawn.
         scenario.welding.posture = "any"
     _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
@@ -254,42 +233,76 @@ def _comment(text: str) -> str:
     return "\n# ".join(textwrap.wrap(text, WIDTH - 2)).replace("{", "{{").replace("}", "}}")
 
 
-def _refused(
-    path: Path, scenario: Scenario, seams: list[SeamConfig], joint: str, standing: PoseConfig, advises: bool
-) -> str:
-    """Write a scenario with seams, and place its part; why the arm can weld them in no pose, else ""."""
-    assert scenario.workpiece is not None
-    scenario.workpiece = dc.replace(scenario.workpiece, seams=seams, joint=joint, pose_guess=standing)
-    _write(path, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=path))
-    scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(path)), advises)
-    return add_scan_poses(scenario, path, reason)
+def offered(
+    path: Path, scenario: Scenario, shape: PartShape, ids: Sequence[int], joint: str | None = None
+) -> tuple[list[Offer], dict[int, str]]:
+    """Say what of a part's edges the arm of a cell can weld: the one rule of `part`, its page and `new`.
 
+    Args:
+        path: where the scenario is written for each try.
+        scenario: the cell; its workpiece is the part, at the pose from which the others follow.
+        shape: the part.
+        ids: edges, as far as possible in the order of travel.
+        joint: of the seams; None: by the angle.
 
-def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[tuple[str, str]]:
-    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried, else "".
-
-    And in which pieces it can; "" where it can as a whole. After MOST_PLANNING_S the rest of the seams is not asked.
+    Returns:
+        What can be welded, each with the part in one pose, the longest first, and why not by edge.
     """
-    found, began = list[tuple[str, str]](), process_time()
+    spec, refused = scenario.workpiece, dict[int, str]()
+    assert spec is not None
+    kind = joint or joint_of(shape.edge(ids[0]))
+    try:
+        for seams, note, apart in ways(shape, ids):
+            scenario.workpiece = dc.replace(spec, seams=seams, joint=kind)
+            places, why = weldable_places(_loaded(path, scenario), apart)
+            reasons = {id: why[k] for k, seam in enumerate(seams) for id in seam.edges if k in why}
+            found = list[Offer]()
+            for pose, chosen in places or [(spec.pose_guess, list(range(len(seams))))]:
+                some = [seams[k] for k in chosen]
+                scenario.workpiece = dc.replace(spec, seams=some, joint=kind, pose_guess=pose)
+                _loaded(path, scenario)
+                if reason := add_scan_poses(scenario, path, "" if places else next(iter(reasons.values()))):
+                    reasons |= {id: reason for seam in some for id in seam.edges if places or not apart}
+                else:
+                    scans = scenario.planning.scan_poses_deg
+                    found.append(Offer(seams=some, joint=kind, pose=pose, note=note, scan_poses_deg=scans))
+            refused |= reasons
+            if found and not apart:
+                return found, {}
+            if apart:
+                refused |= {id: reason for id in ids if (reason := unfit(shape.edge(id)))}
+                welded = {id for offer in found for id in offer.edges}
+                refused = {id: refused[id] for id in ids if id not in welded}
+                kept = [dc.replace(o, note=without([id for id in ids if id not in o.edges], refused)) for o in found]
+                return kept, refused
+    finally:
+        scenario.workpiece = spec
+    return [], refused
+
+
+def planned(
+    part: OwnPart, chains: list[tuple[int, ...]], tool: Path, progress: Progress
+) -> list[tuple[list[Offer], dict[int, str]]]:
+    """Say of each chain of a part's edges what a new cell's arm can weld of it, as `offered`.
+
+    After MOST_PLANNING_S the rest of the chains is not asked.
+    """
+    found, began = list[tuple[list[Offer], dict[int, str]]](), process_time()
     with TemporaryDirectory() as folder:
-        scenario = load_scenario(BASE)
-        first, shape = dc.replace(part, edges=tuple(edge.id for edge in seams[0])), read_shape(part.file, part.units)
-        add_part(scenario, Path(folder), first, load_tool(tool).tool)
+        scenario, shape = load_scenario(BASE), read_shape(part.file, part.units)
+        add_part(scenario, Path(folder), dc.replace(part, edges=chains[0]), load_tool(tool).tool)
         add_tool(scenario, Path(folder), tool)
-        assert scenario.workpiece is not None
-        standing = scenario.workpiece.pose_guess
-        for k, edges in enumerate(seams):
+        for k, ids in enumerate(chains):
             if process_time() - began > MOST_PLANNING_S:
                 break
-            progress(f"plan seam {k + 1} of {len(seams)}", 0.3 + 0.6 * k / len(seams))
-            reason = ""
-            for tried, pieces in ways(shape, [edge.id for edge in edges])[:3]:
-                why = _refused(Path(folder) / CELL, scenario, tried, joint_of(edges[0]), standing, False)
-                reason, note = reason or why, pieces
-                if not why:
-                    break
-            found.append((reason if why else "", "" if why else note))
+            progress(f"plan seam {k + 1} of {len(chains)}", 0.3 + 0.6 * k / len(chains))
+            found.append(offered(Path(folder) / CELL, scenario, shape, ids))
     return found
+
+
+def _loaded(path: Path, scenario: Scenario) -> Scenario:
+    _write(path, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=path))
+    return load_scenario(str(path))
 
 
 def _write(path: Path, scenario: Scenario, state: str) -> None:
@@ -335,150 +348,54 @@ def _line(key: SchemaKey, value: Any, indent: str, written: bool = False) -> str
     return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
 
 
-def add_part(
-    scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool
-) -> list[tuple[list[SeamConfig], str, str]]:
+def add_part(scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool) -> list[tuple[int, ...]]:
     """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
 
     Returns:
-        What to try, each the seams, their joint and what of the part's seam they are, "" for the whole; the best first.
+        The edges of each seam to try, at most MOST_TRIED, the best first.
 
     Raises:
         InputError: the part cannot be read, has no such edge, or no joint.
     """
     shape = read_shape(part.file, part.units)
-    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else to_try(shape, part.file, tool)
-    found = [
-        (seams, part.joint or joint_of(edges[0]), note)
-        for edges in chosen
-        for seams, note in ways(shape, [e.id for e in edges])
-    ]
-    if part.edges:
-        found = [way for way in found if not way[2] or len(way[0]) > 1]  # only what welds all of it
-    whole, rest = [way for way in found if not way[2]], [way for way in found if way[2]]
-    found = [*whole, *sorted(rest, key=lambda way: len(way[0]) == 1)[:MOST_TRIED]]
+    chains = [part.edges] if part.edges else [seam.joint.edges for seam in ranked(shape, tool)][:MOST_TRIED]
+    if not chains:
+        raise InputError(
+            f"{part.file.name} has no concave edge: choose edges with weldcal part {part.file} and give --edges."
+        )
+    seams = ways(shape, chains[0])[0][0]
     scenario.workpiece = WorkpieceConfig(
         file=part.file.name,
         units=part.units,
-        seams=found[0][0],
-        joint=found[0][1],
-        pose_guess=_standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
+        seams=seams,
+        joint=part.joint or joint_of(shape.edge(chains[0][0])),
+        pose_guess=standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
         located_by="scan",
         placement_error=ErrorConfig(OFF_MM, OFF_DEG),
     )
     for file in (part.file, *referenced(part.file)):
         shutil.copyfile(file, folder / file.name)
-    return found
+    return chains
 
 
-def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: str) -> str:
-    """Why no seam of a part can be welded, with what its size and a round seam say of that."""
-    ring = next((joint for joint in shape.joints if list(joint.edges) == seam.edges), None)
-    least = "" if ring is None or "tool does not fit" not in reason else least_pipe(shape, ring, tool)
-    return f"{unit_hint(shape)} {reason}{least}".strip()
-
-
-def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
-    """Return the first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
-
-    There it must also be found in a scan: else the reason is why not. Where there is none: the scenario's own pose, and
-    the reason of the try in which the most seams could be welded; `advises`: with what would help.
-    """
-    assert scenario.workpiece is not None
-    own = scenario.workpiece.pose_guess
-    try:
-        station = make_station(scenario, 0)
-    except WeldcalError as error:
-        return own, str(error)
-    nearest, nearest_pose = (-1.0, ""), own
-    try:
-        part = station.cad
-        if not isinstance(part, Part) or station.tool is None:
-            return (
-                own,
-                "Only a part from a file and a welding tool can be planned. Choose another scenario with --from.",
-            )
-        seams = [numbered(part, k) for k in range(seam_count(part))]
-        line = np.concatenate([seam.seam_P for seam in seams])
-        middles = [0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))]
-        middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > 0.005)]  # nearer they are one place
-        for guess in (_standing(part.mesh, turn, middle, scenario) for middle in middles for turn in TURNS_DEG):
-            welded, reason = _first_refusal(scenario, station, seams, guess)
-            if not reason:
-                return guess, _unseen(scenario, station, seams[0], guess)
-            if welded > nearest[0]:
-                nearest, nearest_pose = (welded, reason), guess
-        if advises:
-            nearest = _first_refusal(scenario, station, seams, nearest_pose, advises=True)
-    finally:
-        station.close()
-    return own, nearest[1]
-
-
-def _first_refusal(
-    scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
-) -> tuple[float, str]:
-    """Count the seams before the first that the arm cannot weld with the part in a pose, and say why ("": all)."""
-    for number, part in enumerate(seams):
-        config = servo_config(scenario, station, number)
-        planning = dc.replace(
-            seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
-        )
-        plan = plan_drawn_seam(planning, 0)
-        if plan.reason is not None:
-            return number, plan.reason
-        if reason := _at_the_table(planning, part, plan):
-            return number + 0.5, reason  # nearer to a weld than where the arm has no way
-    return len(seams), ""
-
-
-def _at_the_table(planning: SeamPlanning, part: WeldPart, plan: PlannedSeam) -> str:
-    """Why the tool would touch the table along a planned seam; "" where it would not."""
-    assert plan.seam is not None
-    p_B = np.asarray(plan.seam.position(np.linspace(0.0, plan.seam.length, 50)))[:, :2]
-    x, y = (np.arange(low, high, TABLE_PITCH_M) for low, high in zip(p_B.min(0) - 0.2, p_B.max(0) + 0.2, strict=True))
-    table = np.stack(np.meshgrid(x, y, [planning.table_z_m]), axis=-1).reshape(-1, 3)
-    try:
-        check_beside(table, part.mesh, planning.X_BP_guess, plan.seam, planning.tool, plan.lean_rad, planning.table_z_m)
-    except NoClearance as error:
-        return str(error)
-    return ""
-
-
-def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseConfig) -> str:
-    """Why the job does not find a part in a scan of it, turned and displaced as the scenario says; "" where it does."""
-    scanner, placed = scenario.scanner, scenario.workpiece
+def _with_advice(
+    shape: PartShape, path: Path, scenario: Scenario, tool: WeldingTool, tried: int, refused: dict[int, str]
+) -> str:
+    """Why no seam of a part can be welded, with what its size, a round seam and the planner say of that."""
+    spec = scenario.workpiece
+    assert spec is not None
+    first = spec.seams[0].edges
+    _, why = weldable_places(_loaded(path, scenario), advises=True)
+    nearest = why.get(0) or refused[first[0]]
     if (
-        not isinstance(scanner, RenderedScanner)
-        or scanner.mounted_on != "base"
-        or placed is None
-        or placed.located_by != "scan"
+        len(first) > 1
+        and (edges := without(first, {id: refused.get(id, nearest) for id in first})).count("Without") > 1
     ):
-        return ""
-    X_BC = PoseConfig(list(scanner.xyz_m), list(scanner.rpy_deg)).pose()
-    off = RotationMatrix.MakeZRotation(np.deg2rad(placed.placement_error.rotation_deg))
-    middle = guess.pose() @ (0.5 * part.mesh.bounds.sum(axis=0))
-    shift = 1e-3 * placed.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
-    X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess.pose()
-    low, high = PLACE_M - np.array(TABLE_M), PLACE_M + np.array(TABLE_M)
-    z = scenario.calibration.table_z_m
-    table = extrude(np.array([low, (high[0], low[1]), high, (low[0], high[1])]), z - 0.02, z)
-    cloud_B = cast([part.mesh.transformed(X_BP), table], X_BC, scanner.scanner(), 0)
-    X_CB = X_BC.inverse()
-    points_C = (cloud_B @ X_CB.rotation().matrix().T + X_CB.translation()).astype(np.float32)
-    config = servo_config(scenario, station, 0)
-    planning = dc.replace(
-        seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=False
-    )
-    return plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason or ""
-
-
-def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
-    """Return the pose of a part on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
-    R = RotationMatrix.MakeZRotation(np.deg2rad(turn_deg)).matrix()
-    x, y = np.array(PLACE_M) - (R @ middle_P)[:2]
-    z = scenario.calibration.table_z_m - float(mesh.bounds[0, 2])
-    return PoseConfig([round(float(v), 4) for v in (x, y, z)], [0.0, 0.0, turn_deg])
+        nearest = edges.replace("Without edge", "Edge")
+    several = f"None of {tried} seams can be welded; the nearest one: " if tried > 1 else ""
+    ring = next((joint for joint in shape.joints if list(joint.edges) == first), None)
+    least = "" if ring is None or "tool does not fit" not in nearest else least_pipe(shape, ring, tool)
+    return f"{unit_hint(shape)} {several}{nearest}{least}".strip()
 
 
 def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:

@@ -1,4 +1,4 @@
-"""Propose from where a scanner on the flange scans a part: overlapping views, each reached and tried by a scan."""
+"""Find where a part stands for the arm to weld it, and from where a scanner on the flange scans it."""
 
 import dataclasses as dc
 import math
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
@@ -16,15 +17,16 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, cast
-from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
+from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planning import plan_drawn_seam, plan_seam
+from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import clear_scan_move, servo_config
-from weldcal.systems.messages import Scan, ScanView
+from weldcal.systems.messages import PlannedSeam, Scan, ScanView
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.systems.station import Station, make_station
+from weldcal.welding.seam.clearance import NoClearance, check_beside
 
 MARGIN_M = 0.025  # least overlap of two scans, and what the outer ones show beyond the part's ends
 TILTS_DEG = (25.0, 12.0, 0.0, -12.0, -25.0)  # of the view about the part's length, towards the seam's side first
@@ -32,6 +34,10 @@ DISTANCES = 8  # from the scanner's best distance to its largest, for a part tha
 TABLE_M = 0.5  # beyond the part, of the scan that is tried
 OFF_M, OFF_RAD = (0.005, 0.0036, 0.0), math.radians(1.5)  # of the part in it from its guess
 CARRIED = "carried_scanner"
+TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
+TRIED_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
+TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
+PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
 def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
@@ -197,3 +203,143 @@ def _refused(scenario: Scenario, station: Station, poses: list[Array]) -> str:
         if reason := plan_seam(planning, last.scan, last.X_BC, ScannerCorrection(), tuple(views[:-1])).reason:
             return reason
     return ""
+
+
+def weldable_places(
+    scenario: Scenario, apart: bool = False, advises: bool = False
+) -> tuple[list[tuple[PoseConfig, list[int]]], dict[int, str]]:
+    """Find poses of a scenario's part on the table in which the arm can weld its seams.
+
+    There it must also be found in a scan.
+
+    Args:
+        scenario: the cell, with a part that has these seams.
+        apart: whether seams may be left out, and welded in different poses.
+        advises: the reasons say what would help.
+
+    Returns:
+        Each pose with the numbers of its seams, the longest first, and why the others are welded in none.
+    """
+    assert scenario.workpiece is not None
+    count = len(scenario.workpiece.seams)
+    try:
+        station = make_station(scenario, 0)
+    except WeldcalError as error:
+        return [], dict.fromkeys(range(count), str(error))
+    tried, found = list[tuple[PoseConfig, dict[int, tuple[float, str]]]](), list[tuple[PoseConfig, list[int]]]()
+    try:
+        part = station.cad
+        if not isinstance(part, Part) or station.tool is None:
+            only = "Only a part from a file and a welding tool can be planned. Choose another scenario with --from."
+            return [], dict.fromkeys(range(count), only)
+        seams = [numbered(part, k) for k in range(seam_count(part))]
+        line = np.concatenate([seam.seam_P for seam in seams])
+        middles = [0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))]
+        middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > 0.005)]  # nearer they are one place
+        for guess in (standing(part.mesh, turn, middle, scenario) for middle in middles for turn in TURNS_DEG):
+            tried.append((guess, _refusals(scenario, station, seams, guess, apart)))
+            if not tried[-1][1]:
+                break
+
+        def welded(refused: dict[int, tuple[float, str]]) -> float:
+            return sum(seams[k].arc_length_m[-1] for k in left if k not in refused)
+
+        left, why = set(range(len(seams))), dict[int, str]()
+        nearest = max(
+            tried, key=lambda at: len(seams) - len(at[1]) + max((near for near, _ in at[1].values()), default=0.0)
+        )
+        while tried and left:
+            best = max(tried, key=lambda at: welded(at[1]))
+            some = sorted(left - best[1].keys())
+            tried.remove(best)
+            if not some or (len(some) < len(seams) and not apart):
+                break  # no pose welds more
+            if unseen := _unseen(scenario, station, seams[some[0]], best[0]):
+                why |= dict.fromkeys(some, unseen)
+            else:
+                found.append((best[0], some if apart else list(range(count))))
+                left -= set(some)
+        if advises and left:
+            nearest = nearest[0], _refusals(scenario, station, seams, nearest[0], apart, advises=True)
+        why = {k: reason for k, (_, reason) in nearest[1].items()} | why
+    finally:
+        station.close()
+    return found, {
+        k: why.get(k, next(iter(why.values()), "")) for k in (left if apart else range(count) if left else ())
+    }
+
+
+def _refusals(
+    scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, every: bool, advises: bool = False
+) -> dict[int, tuple[float, str]]:
+    """Say why the arm cannot weld seams with the part in a pose, by number, and how near it comes, 0 to 1.
+
+    every: else the seams after the first of them are refused with it.
+    """
+    found = dict[int, tuple[float, str]]()
+    for number, part in enumerate(seams):
+        try:
+            config = servo_config(scenario, station, number)
+            planning = dc.replace(
+                seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
+            )
+            plan = plan_drawn_seam(planning, 0)
+        except WeldcalError as error:  # no joint for this tool
+            found[number] = 0.0, str(error)
+        else:
+            if plan.reason is not None:
+                found[number] = 0.0, plan.reason
+            elif reason := _at_the_table(planning, part, plan):
+                found[number] = 0.5, reason  # nearer to a weld than where the arm has no way
+        if found and not every:
+            return found | dict.fromkeys(range(number, len(seams)), found[number])
+    return found
+
+
+def _at_the_table(planning: SeamPlanning, part: WeldPart, plan: PlannedSeam) -> str:
+    """Why the tool would touch the table along a planned seam; "" where it would not."""
+    assert plan.seam is not None
+    p_B = np.asarray(plan.seam.position(np.linspace(0.0, plan.seam.length, 50)))[:, :2]
+    x, y = (np.arange(low, high, TABLE_PITCH_M) for low, high in zip(p_B.min(0) - 0.2, p_B.max(0) + 0.2, strict=True))
+    table = np.stack(np.meshgrid(x, y, [planning.table_z_m]), axis=-1).reshape(-1, 3)
+    try:
+        check_beside(table, part.mesh, planning.X_BP_guess, plan.seam, planning.tool, plan.lean_rad, planning.table_z_m)
+    except NoClearance as error:
+        return str(error)
+    return ""
+
+
+def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseConfig) -> str:
+    """Why the job does not find a part in a scan of it, turned and displaced as the scenario says; "" where it does."""
+    scanner, placed = scenario.scanner, scenario.workpiece
+    if (
+        not isinstance(scanner, RenderedScanner)
+        or scanner.mounted_on != "base"
+        or placed is None
+        or placed.located_by != "scan"
+    ):
+        return ""
+    X_BC = PoseConfig(list(scanner.xyz_m), list(scanner.rpy_deg)).pose()
+    off = RotationMatrix.MakeZRotation(np.deg2rad(placed.placement_error.rotation_deg))
+    middle = guess.pose() @ (0.5 * part.mesh.bounds.sum(axis=0))
+    shift = 1e-3 * placed.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
+    X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess.pose()
+    low, high = PLACE_M - np.array(TRIED_M), PLACE_M + np.array(TRIED_M)
+    z = scenario.calibration.table_z_m
+    table = extrude(np.array([low, (high[0], low[1]), high, (low[0], high[1])]), z - 0.02, z)
+    cloud_B = cast([part.mesh.transformed(X_BP), table], X_BC, scanner.scanner(), 0)
+    X_CB = X_BC.inverse()
+    points_C = (cloud_B @ X_CB.rotation().matrix().T + X_CB.translation()).astype(np.float32)
+    config = servo_config(scenario, station, 0)
+    planning = dc.replace(
+        seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=False
+    )
+    return plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason or ""
+
+
+def standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
+    """Return the pose of a part on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
+    R = RotationMatrix.MakeZRotation(np.deg2rad(turn_deg)).matrix()
+    x, y = np.array(PLACE_M) - (R @ middle_P)[:2]
+    z = scenario.calibration.table_z_m - float(mesh.bounds[0, 2])
+    return PoseConfig([round(float(v), 4) for v in (x, y, z)], [0.0, 0.0, turn_deg])

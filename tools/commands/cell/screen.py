@@ -1,8 +1,8 @@
-"""Which joints of a part a tool fits, and why not the others; the arm is not asked."""
+"""Which joints of a part a tool fits, why not the others, and in which pieces a seam may be welded."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 from weldcal.systems.scenario.parts import LEAST_LEG_M
-from weldcal.systems.scenario.schema import SeamConfig
+from weldcal.systems.scenario.schema import PoseConfig, SeamConfig
+from weldcal.tools.commands.cell.schema import yaml_of
 from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
@@ -26,12 +27,35 @@ from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
-FLUSH_RAD = math.radians(179.0)  # a joint as open as this needs a gap for the tip to feel
-MOST_TRIED = 4  # seams for which a place is looked for, and after these so many of their pieces
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offer:
+    """What of a part's edges a cell's arm can weld with the part in one pose.
+
+    note: in which pieces, or without which edges and why; "" where it is all of them as one seam.
+    scan_poses_deg: of a scanner on the flange.
+    """
+
+    seams: list[SeamConfig]
+    joint: str
+    pose: PoseConfig
+    note: str = ""
+    scan_poses_deg: list[list[float]]
+
+    @property
+    def edges(self) -> list[int]:
+        """The edges that are welded, each once, in the order of the seam."""
+        return list(dict.fromkeys(id for seam in self.seams for id in seam.edges))
+
+    @property
+    def lines(self) -> str:
+        """The lines of a scenario's workpiece that order it."""
+        return f"  seams: {yaml_of(self.seams)}\n  joint: {self.joint}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +65,7 @@ class Seam:
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
     felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was
     asked, too.
-    pieces: in which pieces that arm welds it; "" for one.
+    offers: what that arm can weld of it; refused: why not, by edge.
     """
 
     joint: PartJoint
@@ -50,15 +74,16 @@ class Seam:
     short_m: float = 0.0
     felt: bool = True
     planned: bool = False
-    pieces: str = ""
+    offers: tuple[Offer, ...] = ()
+    refused: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
         """Whether it can be welded, for a table."""
         if self.reason:
             return f"no: {self.reason}"
-        yes = "yes" if self.planned else "fits the tool, not planned"
-        yes = f"{yes}. {self.pieces}".removesuffix(". ")
+        yes = " ".join(["yes." if self.planned else "fits the tool, not planned.", *(o.note for o in self.offers)])
+        yes = yes.strip().removesuffix(".")
         return yes if self.felt else f"{yes}; by the scan, not felt (its sigma comes with the scan)"
 
     def as_row(self) -> dict[str, Any]:
@@ -66,33 +91,58 @@ class Seam:
         j = self.joint
         return {
             "type": f"{j.type} {j.side}".strip(),
+            "bodies": list(j.bodies),
             "edges": list(j.edges),
             "length_mm": 1e3 * j.length_m,
             "angle_deg": math.degrees(j.angle_rad),
             "gap_mm": 1e3 * j.gap_m,
             "least_radius_mm": None if self.radius_m is None else 1e3 * self.radius_m,
-            "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad),
+            "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad) if j.walls_m[0] else None,
             "closed": j.closed,
             "weldable": not self.reason,
             "reason": self.reason,
             "planned": self.planned,
-            "pieces": self.pieces,
+            "pieces": " ".join(offer.note for offer in self.offers if offer.note),
+            "offers": [{"edges": o.edges, "lines": o.lines, "pose_guess": yaml_of(o.pose)} for o in self.offers],
+            "refused": {str(id): why for id, why in self.refused.items()},
             "felt": self.felt,
         }
 
 
-def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """Sort a part's joints: those that the tool can weld, longest first, then the others, nearest miss first.
+def side_of(edge: PartEdge) -> str:
+    """Return the side of the part on which a joint opens, along an axis of its file, as "-y"; "" of an edge of none."""
+    if edge.up_P is None:
+        return ""
+    k = int(np.argmax(np.abs(edge.up_P[:2])))
+    k = k if abs(edge.up_P[k]) > OPEN_ABOVE else 2
+    return ("+" if edge.up_P[k] > 0.0 else "-") + "xyz"[k]
 
-    The arm is not asked.
+
+def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
+    """Sort a part's joints: those that the tool can weld, the felt and the upward ones first, then the nearest misses.
+
+    The arm is not asked. Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
     """
     found = []
-    for joint in shape.joints:
+    for joint in shape.joints or _creases(shape):
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        reason, short_m, felt = _obstacle(shape, joint, tool)
+        reason, short_m, felt = _obstacle(shape, joint, tool) if shape.joints else ("", 0.0, True)
         radius = min(radii, default=None)
         found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt))
-    return sorted(found, key=lambda seam: (bool(seam.reason), not seam.felt, seam.short_m, -seam.joint.length_m))
+    return sorted(found, key=_order)
+
+
+def _order(seam: Seam) -> tuple[Any, ...]:
+    above = seam.joint.up_P[2] > OPEN_ABOVE
+    return (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above, seam.short_m, -seam.joint.length_m)
+
+
+def _creases(shape: PartShape) -> list[PartJoint]:
+    return [
+        PartJoint(type="crease", edges=(e.id,), length_m=e.length_m, angle_rad=e.angle_rad, up_P=np.array([0, 0, 1.0]))
+        for e in shape.edges
+        if e.kind == "concave"
+    ]
 
 
 def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
@@ -122,6 +172,8 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             check_clearance(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
     except WeldcalError as error:
         reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
+        if isinstance(error, NoClearance) and len(joint.edges) > 1:
+            reason = f"edge {id}: {reason}"
         if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
             reason += least_pipe(shape, joint, tool)
         return reason, error.short_m if isinstance(error, NoClearance) else math.inf, felt
@@ -172,16 +224,17 @@ def outside_hint(shape: PartShape) -> str:
     return "The outside of a corner that opens more than 180 deg is not listed and cannot be welded: weld its inside."
 
 
-def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
-    """A seam along edges as a whole, and what it may be welded in: a ring in pieces that overlap, another edge by edge.
+def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str, bool]]:
+    """What edges may be welded in, the whole first: a ring in pieces that overlap, others edge by edge.
 
-    Each with a note of the pieces, "" for the whole.
+    Each with a note of the pieces, "" for the whole, and whether some of its seams may be left out.
     """
-    found, named = [([SeamConfig(edges=list(ids))], "")], ", ".join(map(str, ids))
-    line, closed = chained(shape, ids)
+    runs, named = followed(shape, ids), ", ".join(map(str, ids))
+    found = [([SeamConfig(edges=run) for run in runs], "", False)]
+    line, closed = chained(shape, runs[0])
     steps = np.diff(line[np.linalg.norm(np.diff(line, axis=0, prepend=np.nan), axis=1) != 0.0], axis=0)
     t = steps / np.linalg.norm(steps, axis=1)[:, None]
-    if closed and (np.vecdot(t, np.roll(t, 1, axis=0)) > CORNER_COS).all():
+    if len(runs) == 1 and closed and (np.vecdot(t, np.roll(t, 1, axis=0)) > CORNER_COS).all():
         whole = 1e3 * sum(shape.edge(id).length_m for id in ids)
         ends = [round(share * whole, 1) for share in (0.25, 0.5)]
         edges, rest = list(ids), round(whole - ends[0] - LAP_MM, 1)
@@ -190,23 +243,53 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
             SeamConfig(edges=edges, direction="reverse", start_mm=round(whole - ends[1] - LAP_MM, 1)),
             SeamConfig(edges=edges, start_mm=ends[1], end_mm=-LAP_MM),
         ]
-        found.append((halves, f"The ring {named} in two halves that overlap by {LAP_MM:g} mm."))
+        found.append((halves, f"The ring {named} in two halves that overlap by {LAP_MM:g} mm.", False))
         following = f"start_mm: {ends[0]:g}, end_mm: {round(rest - ends[0], 1):g}"
         quarter = f"For the next, subtract 90 from the last of pose_guess.rpy_deg and write {following}; and so on."
-        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}"))
-        return found
-    by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
-    within = [id for id in ids if shape.edge(id).length_m > LEAST_LEG_M and not _below(shape.edge(id))]
-    if 1 < len(within) < len(ids):
-        left_out = ", ".join(str(id) for id in ids if id not in within)
-        without = f"Without edges {left_out}, which are shorter than {1e3 * LEAST_LEG_M:.0f} mm or open downwards."
-        found.append(([SeamConfig(edges=[id]) for id in within], without))
-    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {named}.") for id in by_length]
+        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}", False))
+    elif len(ids) > 1 and (within := [id for id in ids if not unfit(shape.edge(id))]):
+        found.append(([SeamConfig(edges=[id]) for id in within], "", True))
+    return found
 
 
-def _below(edge: PartEdge) -> bool:
-    """Return whether a joint opens downwards as the part is drawn, where no arm reaches it."""
-    return edge.up_P is not None and float(edge.up_P[2]) < -OPEN_ABOVE
+def followed(shape: PartShape, ids: Sequence[int]) -> list[list[int]]:
+    """Return edges as runs that follow each other, each a seam of its own."""
+    runs = [[ids[0]]]
+    for id in ids[1:]:
+        try:
+            chained(shape, [*runs[-1], id])
+            runs[-1].append(id)
+        except InputError:
+            shape.edge(id)
+            runs.append([id])
+    return runs
+
+
+def unfit(edge: PartEdge) -> str:
+    """Why an edge of a longer seam is not worth a plan, "" where it is."""
+    if edge.length_m <= LEAST_LEG_M:
+        return f"shorter than the {1e3 * LEAST_LEG_M:.0f} mm that the tip needs."
+    below = edge.up_P is not None and float(edge.up_P[2]) < -OPEN_ABOVE
+    return "open downwards as drawn, where no arm reaches." if below else ""
+
+
+def without(ids: Sequence[int], refused: Mapping[int, str]) -> str:
+    """Say which edges are left out, and why; "" for none."""
+    why = {id: refused.get(id, "in another pose of the part.") for id in ids}
+    return " ".join(f"Without {edges_text(some)}: {reason}" for some, reason in by_reason(why))
+
+
+def by_reason(refused: Mapping[int, str]) -> list[tuple[list[int], str]]:
+    """Return the edges that share a reason, with it, in their order."""
+    found = dict[str, list[int]]()
+    for id, why in refused.items():
+        found.setdefault(why, []).append(id)
+    return [(ids, why) for why, ids in found.items()]
+
+
+def edges_text(ids: Sequence[object]) -> str:
+    """Name edges: "edge 5", "edges 5, 6"."""
+    return f"edge{'s' * (len(ids) > 1)} {', '.join(map(str, ids))}"
 
 
 def joint_of(edge: PartEdge) -> str:
@@ -214,23 +297,3 @@ def joint_of(edge: PartEdge) -> str:
     if edge.kind == "flush":
         return "butt"
     return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
-
-
-def to_try(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
-    """Return the seams to try, at most MOST_TRIED, each by its edges.
-
-    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
-    """
-    found = []
-    for seam in ranked(shape, tool):
-        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
-            above = seam.joint.up_P[2] > OPEN_ABOVE
-            order = (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above)
-            found.append((order, [shape.edge(id) for id in seam.joint.edges]))
-    chains = [chain for _, chain in sorted(found, key=lambda pair: pair[0])]
-    if not shape.joints:  # of a mesh of other surfaces
-        concave = [edge for edge in shape.edges if edge.kind == "concave"]
-        chains = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
-    if not chains:
-        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    return chains[:MOST_TRIED]

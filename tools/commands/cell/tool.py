@@ -1,5 +1,6 @@
 """weldcal tool check: draws a tool; weldcal tool measure: measures it by scans, also of its own arm, and touches."""
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,6 +16,7 @@ from weldcal.calibration.data.results import load_result
 from weldcal.calibration.tool.comparison import (
     EXCEEDED,
     HOLDS,
+    UNKNOWN,
     ToolVerdict,
     judge_tool,
     measured_file,
@@ -32,6 +34,8 @@ from weldcal.systems.scenario.schema import Scenario, WeldingConfig
 from weldcal.tools.cli.options import LIVE, Call, Outcome, command, option
 from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
+from weldcal.tools.console import emit_summary
+from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import render, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
@@ -82,7 +86,11 @@ def tool_check(
         picture = tool_picture(loaded)
         write_atomic(folder / "tool.png", picture)
         write_atomic(folder / "tool.html", tool_report(check, picture))
-        return Outcome(check.summary(), values={}, rows=check.rows())
+        rows = check.rows() if call.verbose else {key: check.rows()[key] for key in ("torch", "tip", "least pipe")}
+        made, again = typed("new my_cell --tool-file", file), f"Correct {file}, then:\n{typed('tool check', file)}"
+        last = {"next": again if check.contradictions else made, "page": f"{folder / 'tool.html'} (-v prints all here)"}
+        told = {f"note {k + 1}": text for k, text in enumerate(check.contradictions)} | rows | last
+        return Outcome(check.summary(), text=partial(emit_summary, f"tool check: {check.verdict}", told))
     if calibration is None:
         raise InputError("--measure needs --calibration RESULT: the folder that 'weldcal calibrate' wrote.")
     order = MeasureOrder(
@@ -98,7 +106,7 @@ def tool_check(
     return Outcome(
         report.summary(),
         values={},
-        rows=report.rows(),
+        rows=report.rows(call.verbose),
         problem="" if report.verdict.tolerance == HOLDS else f"{report.verdict.reason} {report.verdict.cause}".strip(),
     )
 
@@ -143,7 +151,7 @@ def tool_measure(
         call.folder("tool-measure", dataset.resolve().name),
         call.progress,
     )
-    return Outcome(report.summary(), values={}, rows=report.rows())
+    return Outcome(report.summary(), values={}, rows=report.rows(call.verbose))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,12 +169,13 @@ class MeasureOrder:
 
 @dataclass(frozen=True, eq=False)
 class MeasureReport:
-    """A measured tool, its verdict, the seam's tolerance mm, and the folder of the result."""
+    """A measured tool, its verdict, the seam's tolerance mm, the folder of the result, and the next step."""
 
     found: ToolMeasurement
     verdict: ToolVerdict
     tolerance_mm: float
     folder: Path
+    following: str = ""
 
     def summary(self) -> dict[str, Any]:
         """Return the JSON object: millimetres and degrees in the flange frame."""
@@ -205,8 +214,8 @@ class MeasureReport:
             "folder": str(self.folder),
         }
 
-    def rows(self) -> dict[str, str]:
-        """What was found, in lines."""
+    def rows(self, every: bool = True) -> dict[str, str]:
+        """What was found, in lines, the verdict first; not `every`: without axis and notes."""
         f = self.found
         rows = {"verdict": self.verdict.reason, "cause": self.verdict.cause}
         for m in f.moves:
@@ -217,9 +226,12 @@ class MeasureReport:
             rows[m.part] = f"{said} {1e3 * m.distance_m:.2f} +- {1e3 * m.margin_m:.2f} mm{turn}"
         if not np.isnan(f.stick_out_m) and f.wire is not None:
             rows["stick-out"] = f"{1e3 * f.stick_out_m:.1f} +- {2e3 * f.stick_out_sigma_m:.1f} mm"
-        rows["wire point"] = "({:.2f}, {:.2f}, {:.2f}) mm".format(*_mm(f.p_FW))
-        rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
-        return rows | {f"note {k + 1}": note for k, note in enumerate(f.notes)}
+        point = "not measured: the wire was not touched" if f.wire is None else "({:.2f}, {:.2f}, {:.2f}) mm"
+        rows["wire point"] = point.format(*_mm(f.p_FW))
+        if every:
+            rows["axis"] = "({:.5f}, {:.5f}, {:.5f})".format(*f.axis)
+            rows |= {f"note {k + 1}": note for k, note in enumerate(f.notes)}
+        return rows | {"next": self.following, "page": str(self.folder / "report.html")}
 
 
 def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, float], None]) -> MeasureReport:
@@ -251,20 +263,27 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
         ring=ring,
         notes=notes,
     )
-    report = MeasureReport(found, judge_tool(found, 1e-3 * welding.tolerance_mm), welding.tolerance_mm, folder)
+    following = typed("tool check", folder / "tool.yaml")
+    if found.wire is None:
+        again = f"{typed('tool measure', order.dataset)} --calibration {shlex.quote(str(order.calibration))}"
+        again += f" --tool {shlex.quote(str(order.tool))} --touches wire_touches.csv"
+        following = f"Touch one point with the wire's end in twelve orientations: wire_touches.csv. Then:\n{again}"
+    verdict = judge_tool(found, 1e-3 * welding.tolerance_mm)
+    report = MeasureReport(found, verdict, welding.tolerance_mm, folder, following)
     tell("writing", 0.9)
     write_atomic(folder / "tool.yaml", tool_text(found, measured_file(found), str(order.dataset)))
     picture = tool_picture(load_tool(folder / "tool.yaml"))
     write_atomic(folder / "tool.png", picture)
     tone: Mapping[str, str] = {HOLDS: "good", EXCEEDED: "bad"}
+    tolerance = verdict.tolerance
     page = render(
         "tool_measurement.html.j2",
         name=loaded.name,
         file=order.tool.name,
-        tone=tone.get(report.verdict.tolerance, "warn"),
-        headline=f"The seam tolerance {report.verdict.tolerance}",
+        tone=tone.get(tolerance, "warn"),
+        headline=f"{'Whether the seam tolerance holds' if tolerance == UNKNOWN else 'The seam tolerance'} {tolerance}",
         verdict_text=f"{report.verdict.reason} {report.verdict.cause}".strip(),
-        rows=[row for row in report.rows().items() if row[0] not in ("verdict", "cause")],
+        rows=[row for row in report.rows().items() if row[0] not in ("verdict", "cause", "next", "page")],
         picture=picture,
     )
     write_atomic(folder / "report.html", page)
@@ -335,7 +354,7 @@ def run_tool_scan(
         return Outcome(held | about | run.timing(), values={}, problem=run.reason or "")
     asked = order(dataset=folder, calibration=Path(config.result), tool=loaded.file)
     report = run_measurement(asked, options.out, lambda stage, share: progress(stage, 0.9 + 0.1 * share))
-    return Outcome(report.summary() | about | run.timing(), values={}, rows={"scans": str(len(poses)), **report.rows()})
+    return Outcome(report.summary() | about | run.timing(), values={}, rows={**report.rows(), "scans": str(len(poses))})
 
 
 def _mm(p: Any) -> list[float]:
