@@ -245,12 +245,23 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
-    """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter."""
+    """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter.
+
+    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is.
+    """
+    reached = 0.0
+
+    def never_less(fraction: float) -> float:
+        nonlocal reached
+        reached = max(reached, min(fraction, 1.0))
+        return reached
+
     if not sys.stderr.isatty():
         last, told = "", 0.0
 
         def report_line(stage: str, fraction: float) -> None:
             nonlocal last, told
+            fraction = never_less(fraction)
             kind = _NUMBER.sub("", stage.partition(", ")[0])  # a count within a stage is no new stage
             if kind != last or fraction >= told + SHARE_TOLD:
                 typer.echo(f"[{100 * fraction:3.0f} %] {title}: {stage}", err=True)
@@ -268,6 +279,6 @@ def progress_bar(title: str) -> Iterator[Progress]:
         task = bar.add_task(title, total=1.0)
 
         def report_bar(stage: str, fraction: float) -> None:
-            bar.update(task, completed=fraction, description=f"{title}: {stage}")
+            bar.update(task, completed=never_less(fraction), description=f"{title}: {stage}")
 
         yield report_bar

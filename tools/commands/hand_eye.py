@@ -37,6 +37,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
+from weldcal.tools.console import emit_warning
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
 from weldcal.tools.report.render import write_atomic
@@ -190,14 +191,16 @@ def _solve(
 ) -> Outcome:
     """Solve with the options of a command, as they were given."""
 
-    def say(sentence: str) -> None:
-        if not call.json:
-            typer.echo(sentence)
-
+    said: list[str] = []
     folder = call.folder("hand-eye", file.resolve().stem)
     stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=say, **options)
-    return Outcome(report.summary(), text=report.text(), first=report.first)
+    try:
+        report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=said.append, **options)
+    except WeldcalError:
+        for sentence in said:  # how the file was read is part of what a refusal says
+            emit_warning(sentence)
+        raise
+    return Outcome(report.summary(), text="\n".join([*said, report.text()]), first=report.first)
 
 
 def run_hand_eye(

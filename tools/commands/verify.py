@@ -163,14 +163,7 @@ def verify(
             stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
             seed=call.seed,
         )
-        settled = paired.verdict
-        return Outcome(
-            paired.summary(),
-            values={},
-            rows=paired.rows(),
-            first=paired.first,
-            problem=f"The verdict is: {settled.verdict}. {settled.reason}" if settled.verdict == DO_NOT else "",
-        )
+        return Outcome(paired.summary(), values={}, rows=paired.rows(), first=paired.first)
     surplus = next((name for name, value in of_pairs.items() if value is not None), None)
     if surplus is not None:
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
@@ -185,13 +178,12 @@ def verify(
         limit_mm=limit_mm,
         pose=pose,
     )
-    verdict, summary = report.verdict, report.summary()
+    summary = report.summary()
     return Outcome(
         summary,
         values={key: value for key, value in summary.items() if key not in ("verdict", "reason")},
         rows=report.interval_rows,
         first=report.first,
-        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )
 
 

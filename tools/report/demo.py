@@ -29,6 +29,7 @@ from weldcal.tools.report.first_screen import (
     refused_note,
     typed,
     upper,
+    verify_next,
     work_point_error,
     work_point_expected,
 )
@@ -116,9 +117,8 @@ class DemoResult:
                 concerns=self.warnings,
                 notes=self.arm_note,
             )
-            more["pose"] = (
-                "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
-            )
+            if scenario.job.calibrate:
+                more["pose"] = "none was found"
             none = ExpectedError("error at the work point, 95 %", "not known", "there is no calibration")
             return FirstScreen(
                 found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
@@ -133,7 +133,7 @@ class DemoResult:
             "the expected error at the work point, one sigma,",
             1e3 * status.predicted_error_m,
             c.required_error_mm,
-            "calibration.required_error_mm, one sigma too; with 95 % probability see below",
+            "calibration.required_error_mm",
         )
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
@@ -209,7 +209,7 @@ class DemoResult:
             part = self.run.cell.scenario.workpiece
             own = part is not None and part.file is not None
             return Next(f"See it again{'' if own else '; then try your own part'}.", typed("view", folder))
-        return Next("Verify with scans that the calibration has not seen.", typed("verify", folder, "NEW_SCANS"))
+        return verify_next(folder)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
