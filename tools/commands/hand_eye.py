@@ -38,7 +38,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 from weldcal.tools.console import emit_warning
-from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.first_screen import check_limit, typed
 from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
 from weldcal.tools.report.render import write_atomic
 
@@ -280,7 +280,7 @@ def run_hand_eye(
         pairs = poses_of_arm(pairs, arm)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
-        raise InputError(f"'{file.name}' is {found.name}. Solve it with 'weldcal hand-eye {right}'.")
+        raise InputError(f"'{file.name}' is {found.name}. Solve it with '{typed(f'hand-eye {right}', file)}'.")
     config = HandEyeConfig(seed=seed)
     pictures: PictureResult | None = None
     if motions:
