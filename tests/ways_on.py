@@ -17,20 +17,25 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import typer.main
+
 from tests.documents.command_lines import CommandLine
-from tests.documents.props import PROPS, lay_out, needs_data
+from tests.documents.props import lay_out, needs_data
+from tests.documents.scans import write_scans
 from tests.documents.test_examples import ONCE
 from tests.places import ROOT, SHARED_DATA
+from weldcal.tools.cli.app import app
 
 # Results that the pages do not make: limits that are met or missed, too little data, mistakes, runs that are held.
 OTHERS = (
     "calibrate my_scans --limit-mm 0.5 --out good",
     "calibrate my_scans --limit-mm 0.01 --out missed",
     "calibrate my_scans --no-scanner-correction --out plain",
+    "calibrate scaled_scans --out corrected",
     "calibrate my_scans --poses pose01:pose05 --out five",
     "calibrate no_such_scans",
     "verify my-calibration my_scans --out again",
-    "verify my-calibration other_scans --limit-mm 0.01 --out refuted",
+    "verify my-calibration other_scans --limit-mm 0.001 --out refuted",
     "verify my-calibration other_scans --limit-mm 0.5 --out confirmed",
     "verify my-calibration three_scans --out few",
     "verify my-profiler other_scans",
@@ -41,7 +46,7 @@ OTHERS = (
     "hand-eye axb-ycz pairs.npz",
     "profiler sphere sphere.npz --limit-mm 0.01 --out profiler_missed",
     "profiler seam groove.npz --calibration my-profiler --limit-mm 0.01 --out seam_missed",
-    "tablet calibrate touches.csv --limit-mm 0.01 --out tablet_missed",
+    "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --limit-mm 0.01 --out tablet_missed",
     "doctor my-calibration",
     "new my_clamp --part clamp.stl",
     "new my_cell --part bracket.step --edges 99",
@@ -64,12 +69,18 @@ SUPPLIED = (
     ("and name the file of its scans", "groove.npz"),
     ("and name their file", "sphere.npz"),
     ("with your scenario", "s_groove"),
+    ("and the name of a scan", "my_scans/clouds/pose03.npz"),
+    ("with its file", "bracket.step"),
 )
 SHOWN_S = 60.0  # a job that is a way on is interrupted after so long; it leads on once a phase has begun
 DEEPEST = 2  # ways on of ways on
 QUOTED = re.compile(r"['`](weldcal [a-z](?:[^'`]|'[^' ]+')*?)['`](?=[\s.,;:)]|$)")
 BARE = re.compile(r"(?:^|\s{2,}|: )(weldcal [a-z][^\n]*)$", re.MULTILINE)
 NAMED_FILE = re.compile(r"\b(?:[Ss]ee|in|to|report|written to) +([\w./-]+\.(?:html|csv|md|yaml|json))\b")
+LOOSE = re.compile(r"\bweldcal [a-z][a-z-]+(?: [a-z][a-z-]+)?")  # in a sentence, without quotes
+COMMANDS = {name.split()[0] for name in typer.main.get_command(app).commands}  # type: ignore[attr-defined]
+PLACEHOLDER = re.compile(r"(?<![\w./-])[A-Z][A-Z_]{3,}(?![\w./-])")
+MADE = {"scaled_scans": lambda path: write_scans(path, 12, 0, 1.003)}  # beside those of the pages
 NO_FILES_OF_RESULTS = ("dataset.yaml", "poses.csv", "scenario.yaml", "cell.yaml")  # of the user, by their names
 
 
@@ -133,6 +144,8 @@ def offered(text: str) -> tuple[list[str], list[str]]:
         rest = flat[found.end() : found.end() + 60]
         end = next((prop for words, prop in SUPPLIED if rest.lstrip(" ").startswith(words)), None)
         (named if end is None else whole).append(found[1] + (f" {end}" if end else ""))
+    loose = [found for found in LOOSE.findall(flat) if not any(text.startswith(found) for text in (*whole, *named))]
+    named += [text for text in loose if text.split()[1] in COMMANDS]
     return list(dict.fromkeys(whole)), list(dict.fromkeys(named))
 
 
@@ -159,6 +172,9 @@ class Walk:
         line = f"weldcal {words}"
         made = CommandLine(line).makes
         lay_out(words, self.folder, made)
+        for name, make in MADE.items():
+            if name in words and not (self.folder / name).exists():
+                make(self.folder / name)
         before, count = set(self.folder.rglob("*.html")), len(self.ways)
         ran = self._run(line)
         self._judge(line, ran, ())
@@ -178,18 +194,25 @@ class Walk:
             self.ways += [
                 Way(path[-1], text, "a button without a text") for text in of_page if text.startswith("no text")
             ]
-        self.ways += [Way(path[-1], text, why) for text in named if (why := self._unusable(text))]
+        placed = [text for text in whole if PLACEHOLDER.search(text)]
+        self.ways += [Way(path[-1], text, "a placeholder stands in it") for text in placed]
+        whole = [text for text in whole if text not in placed]
+        self.ways += [Way(path[-1], text, self._unusable(text)) for text in named]
         self.ways += [Way(path[-1], text, "no such file") for text in self._absent(ran)]
         for line in whole:
             if line in path:
                 self.ways.append(Way(path[-1], line, "it leads back"))
                 continue
             for words, prop in SUPPLIED:
-                if line.endswith(f" {prop}") and prop in PROPS and words:
+                if line.endswith(f" {prop}") and words:
                     lay_out(prop, self.folder)
             before = set(self.folder.rglob("*.html"))
             after = self._run(line)
             self._judge(path[-1], after, path)
+            if after.code == 1 and after.err == ran.err:
+                self.ways.append(Way(path[-1], line, "it says the same again"))
+            if after.code == 2:
+                continue
             if len(path) <= DEEPEST and not after.begun:
                 self._follow(after, (*path, line), sorted(set(self.folder.rglob("*.html")) - before))
 
@@ -245,20 +268,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.ways_on", description=__doc__)
     parser.add_argument("--only", default="", metavar="REGEX", help="Only the results whose command it matches.")
     asked = parser.parse_args()
-    ok = total = 0
+    ok = total = leading = 0
     with tempfile.TemporaryDirectory(prefix="weldcal-ways-") as scratch:
         walk = Walk(Path(scratch))
         for words in results(asked.only):
             began = time.monotonic()
             ways = walk.result(words)
             wrong = [way for way in ways if way.wrong]
-            ok, total = ok + (not wrong), total + 1
+            ok, total, leading = ok + (not wrong), total + 1, leading + bool(ways)
             mark = "leads on" if not wrong else "DOES NOT"
             sys.stdout.write(f"{mark}  {time.monotonic() - began:6.1f} s  {len(ways)} ways  {words}\n")
             sys.stdout.writelines(f"    {way.printed}\n        {way.wrong}\n" for way in wrong)
             sys.stdout.flush()
     steps = len({way.printed for way in walk.ways})
-    sys.stdout.write(f"\n{ok} of {total} lead on ({steps} different ways)\n")
+    sys.stdout.write(f"\n{ok} of {total} lead on: {leading} of them offer {steps} different ways\n")
     return 0 if ok == total else 1
 
 

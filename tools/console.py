@@ -76,7 +76,8 @@ def emit_summary(title: str, rows: Mapping[str, str], most: int | None = None) -
 
 MOST_NAME = 26
 WHOLE = ("p[", "weldcal ", "[[")
-"""Beginnings of lines that an operator copies: they stay whole."""
+"""Beginnings of lines that an operator copies: they stay whole, as does a command between quotes."""
+_JOINED = "\x1f"
 
 
 def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
@@ -88,9 +89,11 @@ def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
             found.append(line)
             continue
         inner = " " * (len(line) - len(line.lstrip()) + (2 if line.startswith("- ") else 0))
-        found += textwrap.wrap(
-            line, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
-        ) or [""]
+        whole = re.sub(r"'weldcal [^']+'", lambda command: command[0].replace(" ", _JOINED), line)
+        wrapped = textwrap.wrap(
+            whole, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
+        )
+        found += [text.replace(_JOINED, " ") for text in wrapped] or [""]
     lines = [indent + line for line in found]
     if len(name) > column:
         return [f"  {name}", *lines]

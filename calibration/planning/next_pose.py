@@ -115,17 +115,20 @@ class NextPose:
     q: Array | None = None
     checked: str = ""
 
+    def brief(self) -> str:
+        """Return the pose in one sentence, without how it was found."""
+        gain = f"the uncertainty then falls to {1e3 * self.sigma_after:.2f} mm"
+        if self.X_BF is None:
+            return f"Add a pose like sample {self.like}, with the target turned by {self.turn_deg:.0f} deg: {gain}."
+        return f"Add the pose with the flange at {_place(self.X_BF)}: {gain}."
+
     def sentence(self) -> str:
         """Instruction for the operator."""
         a = "(" + ", ".join(f"{v + 0.0:+.2f}" for v in self.axis_C) + ")"
         before = "open" if not np.isfinite(self.sigma_before) else f"{1e3 * self.sigma_before:.2f} mm"
         where = ""
         if self.X_BF is not None:
-            p, w = 1e3 * self.X_BF.translation(), log_rotation(self.X_BF.rotation().matrix()[None])[0]
-            where = (
-                f" Flange at ({p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f}) mm, rotation vector "
-                f"({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
-            )
+            where = f" Flange at {_place(self.X_BF)}."
         joints = ""
         if self.q is not None:
             joints = " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
@@ -134,6 +137,11 @@ class NextPose:
             f" the uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints}"
             f" {self.checked}"
         ).rstrip()
+
+
+def _place(X: RigidTransform) -> str:
+    p, w = 1e3 * X.translation(), log_rotation(X.rotation().matrix()[None])[0]
+    return f"({p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f}) mm, rotation vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad"
 
 
 def next_pose(

@@ -53,13 +53,13 @@ def flange_poses(n: int, rng: np.random.Generator) -> list[RigidTransform]:
     return poses
 
 
-def write_scans(folder: Path, n: int, seed: int) -> Path:
-    """A dataset of n scans, pose01 and so on, of a scanner at X_BC."""
+def write_scans(folder: Path, n: int, seed: int, scale: float = 1.0) -> Path:
+    """A dataset of n scans, pose01 and so on, of a scanner at X_BC whose lengths are off by a factor."""
     rng = np.random.default_rng(seed)
     poses = {f"pose{k + 1:02d}": X_CF for k, X_CF in enumerate(flange_poses(n, rng))}
     header = DatasetHeader(schema=1, robot="ur10e", flange=FLANGE, scanner="phoxi_m", configuration="eye_on_base")
     header.scanner_guess = ScannerGuess(xyz=[0.65, 0.0, 0.95], wxyz=X_BC.rotation().ToQuaternion().wxyz().tolist())
-    clouds = {id: flange_scan(X_CF, rng) for id, X_CF in poses.items()}
+    clouds = {id: scale * flange_scan(X_CF, rng) for id, X_CF in poses.items()}
     save_dataset(folder, header, {id: X_BC @ X_CF for id, X_CF in poses.items()}, clouds)
     _add_joints(folder / "poses.csv", list(poses.values()))
     return folder

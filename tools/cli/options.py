@@ -323,13 +323,10 @@ MOST_LINES = 12
 
 def _emit_first(title: str, first: "FirstScreen", written: Path | None) -> None:
     """Prints the verdict and what follows from it, with as many of the concerns and notes as fit."""
-    files = "" if written is None else f"{written / 'report.html'} (-v prints every figure here)"
-    of_concerns, of_notes = len(first.concerns), len(first.notes)
-    sizes = [(c, n) for c in range(of_concerns, min(of_concerns, 1) - 1, -1) for n in range(of_notes, -1, -1)]
-    sizes.sort(key=lambda size: (-min(size), -sum(size)))
-    for number, (concerns, notes) in [(number, size) for number in range(first.steps, 0, -1) for size in sizes]:
-        rows = first.brief(concerns, notes, number) | {"report": files}
-        last = (concerns, notes, number) == (min(of_concerns, 1), 0, 1)
+    files = "" if written is None else f"{written / 'report.html'} (-v: all)"
+    for size in first.sizes:
+        rows = first.brief(*size) | {"report": files}
+        last = size == first.sizes[-1]
         if console.emit_summary(f"{title}: {first.verdict}", rows, most=None if last else MOST_LINES):
             return
 

@@ -161,7 +161,7 @@ class CalibrationReport:
         scale = "" if applied is None else f"; the scanner is corrected by {1e2 * (applied.scale - 1.0):+.2f} %"
         return {
             "scans used": f"{n - len(left)} of {n}{names}{scale or '; the scanner is not corrected'}",
-            "UR and ROS 2": "ur_pose.script, static_transform.sh and scanner.urdf.xacro beside the report",
+            "UR and ROS 2": "ur_pose.script, static_transform.sh beside the report",
         }
 
     @property

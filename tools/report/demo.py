@@ -174,7 +174,8 @@ class DemoResult:
         if self.weld is None or self.weld.error is None:
             return {}
         torch = self._torch()
-        return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
+        brief = torch.backing.partition(", in the first")[0]
+        return {"torch": f"{torch.figure} ({brief})"} if self.status.estimate is not None else {}
 
     def _torch(self) -> ExpectedError:
         """The torch's distance from the true seam."""
@@ -194,7 +195,7 @@ class DemoResult:
             if self.broken:
                 return Next(
                     "Remove the cause that is named above, and move the arm home. Then go on from the crater.",
-                    f"weldcal weld --resume {folder}",
+                    typed("weld --resume", folder),
                 )
             if self.weld is None and not self.n_scans:
                 return after_hold(self.run.ended_by_operator)

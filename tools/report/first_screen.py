@@ -82,9 +82,7 @@ USE, CARE, DO_NOT = "use it", "use with care", "do not use"
 ENOUGH_UNSEEN = 4
 """Unseen poses (scans, frames, landmarks) from which on they back a verdict; `verify` asks for as many new scans."""
 MOST_CONCERNS = 3
-NO_TOLERANCE = (
-    "No tolerance is stated, so this result cannot be judged for your job. State the allowed error with --limit-mm."
-)
+NO_TOLERANCE = "No tolerance is stated: add --limit-mm with the allowed error."
 
 
 @dataclass(frozen=True)
@@ -151,9 +149,9 @@ AGAINST = Next("Remove what the verdict names, or add data that vary more. Then 
 """The next step in the place of one that relies on a result which is not to be used."""
 
 
-def verify_next(folder: Path | str, lead: str = "Take four or more new scans, and verify with them") -> Next:
+def verify_next(folder: Path | str, lead: str = "Take four or more new scans") -> Next:
     """Return the step to judge the result in a folder with scans that are still to be taken."""
-    return Next(f"{lead}: run '{typed('verify', folder)}' and name their folder.", uses=True)
+    return Next(f"{lead}. Run '{typed('verify', folder)}' and name their folder.", uses=True)
 
 
 def typed(command: str, path: Path | str, *more: str) -> str:
@@ -165,7 +163,7 @@ def typed(command: str, path: Path | str, *more: str) -> str:
 class ShownPose:
     """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m.
 
-    ``sigma``: its uncertainty in words. ``aside``: the report and ``-v`` show it, the brief screen does not.
+    ``sigma``: its uncertainty in words, of the position first. ``aside``: the report and ``-v`` show it, the brief screen does not.
     """
 
     symbol: str
@@ -200,7 +198,7 @@ class ShownPose:
         """Position and rotation vector on one line."""
         p, r = 1e3 * self.X.translation(), rotation_vector(self.X.rotation())
         line = f"{p[0]:.3f}, {p[1]:.3f}, {p[2]:.3f} mm; rotation vector {r[0]:.6f}, {r[1]:.6f}, {r[2]:.6f} rad"
-        return f"{line}\none sigma {self.sigma}" if self.sigma else line
+        return f"{line}; one sigma {self.sigma.partition('; ')[0]}" if self.sigma else line
 
     def rows(self) -> dict[str, str]:
         """Return the rows for the terminal."""
@@ -297,11 +295,6 @@ class FirstScreen:
         return f"The verdict is: {DO_NOT}. {self.reason}" if self.verdict == DO_NOT else ""
 
     @property
-    def steps(self) -> int:
-        """Number of sentences of the next step."""
-        return len(sentences(self.next.text))
-
-    @property
     def next(self) -> Next:
         """The step; another one where it relies on a result that is not to be used."""
         return AGAINST if self.step.uses and self.verdict == DO_NOT else self.step
@@ -338,8 +331,17 @@ class FirstScreen:
             rows |= {name + " " * k: text for name, text in pose.rows().items()}
         return rows
 
-    def brief(self, concerns: int, notes: int, steps: int) -> dict[str, str]:
-        """Return the rows for a terminal with few lines: so many concerns, notes and sentences of the next step."""
+    @property
+    def sizes(self) -> list[tuple[int, int, int, int]]:
+        """Sizes of the brief screen from the longest on: other results, sentences of the step, concerns, notes."""
+        c, n = len(self.concerns), len(self.notes)
+        texts = [(k, m) for k in range(c, min(c, 1) - 1, -1) for m in range(n, -1, -1)]
+        texts.sort(key=lambda size: (-min(size), -sum(size)))
+        steps, more = range(len(sentences(self.next.text)), 0, -1), range(len(self.more), -1, -1)
+        return [(others, number, *size) for others in more for number in steps for size in texts]
+
+    def brief(self, others: int, steps: int, concerns: int, notes: int) -> dict[str, str]:
+        """Return the rows for a terminal with few lines, in one of its ``sizes``."""
 
         def listed(texts: Sequence[str], number: int) -> str:
             shown = [f"- {first_sentence(text)}" for text in texts[:number]]
@@ -348,7 +350,7 @@ class FirstScreen:
 
         rows = {"why": self.reason, "result": f"{self.expected.what}: {self.expected.figure}"}
         rows |= {pose.symbol: pose.line for pose in self.poses if not pose.aside}
-        rows |= {name: first_sentence(text) for name, text in self.more.items()}
+        rows |= {name: first_sentence(text) for name, text in list(self.more.items())[:others]}
         rows |= {"could be wrong": listed(self.concerns, concerns) or self.nothing}
         rows |= {"good to know": listed(self.notes, notes)}
         return rows | {"next": self.next.command or " ".join(sentences(self.next.text)[:steps])}

@@ -68,13 +68,13 @@ class HandEyeReport:
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
         if self.next_pose is not None:
-            after = Next(f"Add a pose to reduce the uncertainty, like {self.advice.removeprefix('Like ')}")
+            after = Next(f"{self.next_pose.brief()} {self.advice}")
         elif self.advice:
             after = Next(self.advice)
         else:
             after = Next("Record pairs that are not in the file, and verify the result with them.", uses=True)
         symbol = self.mounting.unknowns["X"].symbol
-        files = {"UR and ROS 2": f"{symbol}.ur_pose.script and {symbol}.static_transform.sh beside the report"}
+        files = {"UR and ROS 2": f"{symbol}.ur_pose.script, {symbol}.static_transform.sh"}
         return FirstScreen(found, expected, after, shown_poses(r, self.mounting), files)
 
     def summary(self) -> dict[str, object]:

@@ -17,6 +17,7 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     ShownPose,
+    typed,
     upper,
 )
 from weldcal.tools.report.pictures import error_bars
@@ -142,7 +143,7 @@ class PairsReport:
     def _next(self) -> Next:
         v = self.verdict.verdict
         board = f" --board {self.board}" if self.board else ""
-        solve = f"weldcal hand-eye ax-yb {self.pairs} --mounting {self.mounting.name}{board}"
+        solve = typed("hand-eye ax-yb", self.pairs, f"--mounting {self.mounting.name}{board}")
         if v == USE:
             return Next("Use RESULT. Verify again after work at the robot or the camera.")
         if v == DO_NOT and self.judgement.other is not None:

@@ -156,7 +156,7 @@ def new(
         if part is not None and written.name == UNFINISHED:
             problem = (
                 f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
-                f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
+                f"Choose other edges from '{typed('part', part)}' and give --edges, or change {written}."
             )
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)

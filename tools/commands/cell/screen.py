@@ -19,6 +19,7 @@ from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_he
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 from weldcal.systems.scenario.parts import LEAST_LEG_M
 from weldcal.systems.scenario.schema import SeamConfig
+from weldcal.tools.report.first_screen import typed
 from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
@@ -232,5 +233,7 @@ def to_try(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdg
         concave = [edge for edge in shape.edges if edge.kind == "concave"]
         chains = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
     if not chains:
-        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
+        raise InputError(
+            f"{part.name} has no concave edge: choose edges with '{typed('part', part)}' and give --edges."
+        )
     return chains[:MOST_TRIED]
