@@ -37,7 +37,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
-from weldcal.tools.console import emit_warning
 from weldcal.tools.report.first_screen import check_limit, typed
 from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
 from weldcal.tools.report.render import write_atomic
@@ -197,8 +196,8 @@ def _solve(
     try:
         report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=said.append, **options)
     except WeldcalError:
-        for sentence in said:  # how the file was read is part of what a refusal says
-            emit_warning(sentence)
+        for sentence in said if not call.json else ():  # how the file was read is part of what a refusal says
+            typer.echo(sentence)
         raise
     return Outcome(report.summary(), text="\n".join([*said, report.text()]), first=report.first)
 

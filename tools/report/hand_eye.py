@@ -67,11 +67,8 @@ class HandEyeReport:
         found = Findings(
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
-        if self.next_pose is not None:
-            after = Next(f"{self.next_pose.brief()} {self.advice}")
-        elif self.advice:
-            after = Next(self.advice)
-        else:
+        after = Next(self.advice)
+        if not self.advice:
             after = Next("Record pairs that are not in the file, and verify the result with them.", uses=True)
         symbol = self.mounting.unknowns["X"].symbol
         files = {"UR and ROS 2": f"{symbol}.ur_pose.script, {symbol}.static_transform.sh"}
