@@ -163,7 +163,7 @@ def typed(command: str, path: Path | str, *more: str) -> str:
 class ShownPose:
     """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m.
 
-    ``sigma``: its uncertainty in words, of the position first. ``aside``: the report and ``-v`` show it, the brief screen does not.
+    ``sigma``: its uncertainty in words, of the position first. ``aside``: not on the brief screen.
     """
 
     symbol: str
