@@ -150,7 +150,7 @@ def _moved(c: Cause) -> tuple[str, str]:
             f"From '{c.where[1]}' on the scans agree on another camera pose than up to '{c.where[0]}':"
             f" {c.numbers['shift_mm']:.2f} mm and {c.numbers['turn_deg']:.3f} degrees apart; {_fits(c)}."
         ),
-        f"Fasten the scanner. Calibrate only the later part: 'weldcal calibrate --poses {c.where[1]}:', its folder.",
+        f"Fasten the scanner. Calibrate only the later part with 'weldcal calibrate --poses {c.where[1]}:'.",
     )
 
 
