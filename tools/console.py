@@ -76,7 +76,8 @@ def emit_summary(title: str, rows: Mapping[str, str], most: int | None = None) -
 
 MOST_NAME = 26
 WHOLE = ("p[", "weldcal ", "[[")
-"""Beginnings of lines that an operator copies: they stay whole."""
+"""Beginnings of lines that an operator copies: they stay whole, as does a command between quotes."""
+_JOINED = "\x1f"
 
 
 def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
@@ -88,9 +89,11 @@ def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
             found.append(line)
             continue
         inner = " " * (len(line) - len(line.lstrip()) + (2 if line.startswith("- ") else 0))
-        found += textwrap.wrap(
-            line, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
-        ) or [""]
+        whole = re.sub(r"'weldcal [^']+'", lambda command: command[0].replace(" ", _JOINED), line)
+        wrapped = textwrap.wrap(
+            whole, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
+        )
+        found += [text.replace(_JOINED, " ") for text in wrapped] or [""]
     lines = [indent + line for line in found]
     if len(name) > column:
         return [f"  {name}", *lines]
@@ -245,12 +248,23 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
-    """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter."""
+    """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter.
+
+    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is.
+    """
+    reached = 0.0
+
+    def never_less(fraction: float) -> float:
+        nonlocal reached
+        reached = max(reached, min(fraction, 1.0))
+        return reached
+
     if not sys.stderr.isatty():
         last, told = "", 0.0
 
         def report_line(stage: str, fraction: float) -> None:
             nonlocal last, told
+            fraction = never_less(fraction)
             kind = _NUMBER.sub("", stage.partition(", ")[0])  # a count within a stage is no new stage
             if kind != last or fraction >= told + SHARE_TOLD:
                 typer.echo(f"[{100 * fraction:3.0f} %] {title}: {stage}", err=True)
@@ -262,12 +276,14 @@ def progress_bar(title: str) -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
+    from rich.table import Column
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    words = TextColumn("{task.description}", table_column=Column(no_wrap=False))  # a long stage takes a second line
+    columns = (words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=1.0)
 
         def report_bar(stage: str, fraction: float) -> None:
-            bar.update(task, completed=fraction, description=f"{title}: {stage}")
+            bar.update(task, completed=never_less(fraction), description=f"{title}: {stage}")
 
         yield report_bar

@@ -383,7 +383,8 @@ def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
     """Where a user of the pose finds the scanner correction: the command and the Python call that apply it."""
     call = f", in Python weldcal.read_calibration({str(file)!r}).correct(points)" if symbol == "X_BC" else ""
     return (
-        f"{symbol} applies to corrected scanner points: weldcal apply {shlex.quote(str(file))} CLOUD writes them{call}."
+        f"{symbol} applies to corrected scanner points: 'weldcal apply {shlex.quote(str(file))}' and the name of a scan"
+        f" writes them{call}."
     )
 
 

@@ -116,24 +116,23 @@ class NextPose:
     checked: str = ""
 
     def sentence(self) -> str:
-        """Instruction for the operator."""
+        """Instruction for the operator; its first sentence names the pose."""
         a = "(" + ", ".join(f"{v + 0.0:+.2f}" for v in self.axis_C) + ")"
         before = "open" if not np.isfinite(self.sigma_before) else f"{1e3 * self.sigma_before:.2f} mm"
-        where = ""
+        gain = f"the uncertainty at the work point falls from {before} to {1e3 * self.sigma_after:.2f} mm"
+        like = (
+            f"like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera"
+        )
+        said = f"Add a pose {like}: {gain}."
         if self.X_BF is not None:
             p, w = 1e3 * self.X_BF.translation(), log_rotation(self.X_BF.rotation().matrix()[None])[0]
-            where = (
-                f" Flange at ({p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f}) mm, rotation vector "
-                f"({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
+            said = (
+                f"Add the pose with the flange at ({p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f}) mm, rotation vector "
+                f"({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad: {gain}. It is {like}."
             )
-        joints = ""
         if self.q is not None:
-            joints = " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
-        return (
-            f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera:"
-            f" the uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints}"
-            f" {self.checked}"
-        ).rstrip()
+            said += " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
+        return f"{said} {self.checked}".rstrip()
 
 
 def next_pose(

@@ -98,7 +98,7 @@ class PartShape:
         found = next((e for e in self.edges if e.id == id), None)
         if found is None:
             raise InputError(
-                f"'{self.name}' has no edge {id}: its edges are 1 to {len(self.edges)}; weldcal part {self.name} lists"
-                " them."
+                f"'{self.name}' has no edge {id}: its edges are 1 to {len(self.edges)}; 'weldcal part' with its file"
+                " lists them."
             )
         return found

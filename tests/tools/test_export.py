@@ -247,7 +247,7 @@ def test_every_file_says_that_points_are_corrected(tmp_path: Path) -> None:
     assert "corrected" in export(result, "--ros2", tmp_path / "ros")
     export(result, "--drake-directives", tmp_path / "ros" / "station.dmd.yaml")
     for path in (tmp_path / "ros").glob("s*.*"):
-        assert path.is_dir() or "corrected scanner points: weldcal apply" in path.read_text(), path.name
+        assert path.is_dir() or "corrected scanner points: 'weldcal apply" in path.read_text(), path.name
 
 
 @pytest.mark.parametrize(

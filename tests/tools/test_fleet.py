@@ -65,7 +65,8 @@ def test_a_moved_cell_and_one_without_enough_scans_need_a_visit_and_a_good_one_d
         write_cell(tmp_path / "cells" / name, fault, 2, np.random.default_rng(5))
     call = ["fleet", str(tmp_path / "cells"), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
     done = CliRunner().invoke(app, call)
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 1, done.output
+    assert "do not use, for the first calibration of hall/moved." in done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert (found["cells"], found["datasets"], found["fine"]) == (3, 6, 1)
     assert set(found["visit"]) == {"hall/moved", "broken"}

@@ -119,8 +119,9 @@ class Outcome:
         summary: the JSON object; its `state`, if not "done", ends the command with exit code 1.
         values: printed as rows instead of the summary; {} for none.
         rows: printed below them.
-        text: printed, or called to print, instead of all rows.
-        first: the first screen of its report, printed below the rows with the report's path.
+        text: printed, or called to print, instead of all rows; beside a first screen only with -v.
+        first: the first screen of its report, printed below the rows with the report's path; "do not use" ends the
+            command with exit code 1.
         problem: a sentence for stderr, with exit code 1; None: taken from the summary, "": none.
     """
 
@@ -322,23 +323,24 @@ MOST_LINES = 12
 
 def _emit_first(title: str, first: "FirstScreen", written: Path | None) -> None:
     """Prints the verdict and what follows from it, with as many of the concerns and notes as fit."""
-    files = "" if written is None else f"{written / 'report.html'} (-v prints every figure here)"
-    of_concerns, of_notes = len(first.concerns), len(first.notes)
-    sizes = [(c, n) for c in range(of_concerns, min(of_concerns, 1) - 1, -1) for n in range(of_notes, -1, -1)]
-    for concerns, notes in sorted(sizes, key=lambda size: (-min(size), -sum(size))):
-        rows = first.brief(concerns, notes) | {"report": files}
-        last = (concerns, notes) == (min(of_concerns, 1), 0)
+    files = "" if written is None else f"{written / 'report.html'} (-v: all)"
+    for size in first.sizes:
+        rows = first.brief(*size) | {"report": files}
+        last = size == first.sizes[-1]
         if console.emit_summary(f"{title}: {first.verdict}", rows, most=None if last else MOST_LINES):
             return
 
 
 def _emit_all(title: str, outcome: Outcome, first: "FirstScreen", written: Path | None) -> None:
-    """Prints every row, then the same as the first screen of the report, and the report's path."""
+    """Prints every row or the text, then the same as the first screen of the report, and the report's path."""
     values = dict(outcome.summary if outcome.values is None else outcome.values)
     values.pop("unobservable", None)  # what matters to the pose is among the first screen's concerns
     if isinstance(warnings := values.get("warnings"), list):
         values["warnings"] = [text for text in warnings if text not in (*first.concerns, *first.notes)]
-    console.emit_summary(title, console.rows(values) | dict(outcome.rows))
+    if isinstance(outcome.text, str):
+        console.emit_text(outcome.text)
+    else:
+        console.emit_summary(title, console.rows(values) | dict(outcome.rows))
     rows = first.rows()
     if written is not None:
         rows |= {"written to": str(written), "report": str(written / "report.html")}
@@ -347,7 +349,7 @@ def _emit_all(title: str, outcome: Outcome, first: "FirstScreen", written: Path 
 
 
 def report(title: str, outcome: Outcome, call: Call) -> None:
-    """Prints the outcome (with --json as JSON) and ends with exit code 1 where there is a problem.
+    """Prints the outcome (with --json as JSON) and ends with exit code 1 where there is a problem or "do not use".
 
     Raises:
         typer.Exit: with code 1.
@@ -358,22 +360,23 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     first = outcome.first
     if call.json:
         console.emit_json(summary if first is None else {"first_screen": first.document(), **summary})
-    elif outcome.text is not None:
-        if callable(outcome.text):
-            outcome.text()
-        else:
-            console.emit_text(outcome.text)
-    elif first is not None and call.verbose:
+    elif first is not None and not call.verbose:
+        _emit_first(title, first, call.written)
+    elif first is not None:
         _emit_all(f"{title}: {state}", outcome, first, call.written)
-    elif first is None:
+    elif callable(outcome.text):
+        outcome.text()
+    elif outcome.text is not None:
+        console.emit_text(outcome.text)
+    else:
         rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
         rows |= {} if call.written is None else {"written to": str(call.written)}
         console.emit_summary(f"{title}: {state}", rows)
-    if first is not None and not call.json and not call.verbose:
-        _emit_first(title, first, call.written)
     problem = outcome.problem
     if problem is None and state != "done":
         problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")
+    if not problem and first is not None:
+        problem = first.refusal if call.json or not first.refusal else f"The verdict is: {first.verdict}."
     if problem:
         console.emit_warning(problem)
         raise typer.Exit(1)

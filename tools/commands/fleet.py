@@ -13,7 +13,7 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.report.first_screen import CARE
+from weldcal.tools.report.first_screen import CARE, DO_NOT
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic, write_json
 
@@ -51,7 +51,9 @@ def fleet(
     counts = {name: summary[name] for name in ("cells", "datasets", "fine")} | {
         name: len(report.named(name)) for name in (VISIT, LOOK)
     }
-    return Outcome(summary, values=counts, rows={**shown, "report": str(out / "report.html")})
+    refuted = [cell.name for cell in report.cells if cell.since is not None]
+    problem = f"The verdict is: {DO_NOT}, for the first calibration of {', '.join(refuted)}." if refuted else ""
+    return Outcome(summary, values=counts, rows={**shown, "report": str(out / "report.html")}, problem=problem)
 
 
 def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: int = 0) -> FleetReport:

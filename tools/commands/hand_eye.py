@@ -37,7 +37,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
-from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.first_screen import check_limit, typed
 from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
 from weldcal.tools.report.render import write_atomic
 
@@ -190,14 +190,16 @@ def _solve(
 ) -> Outcome:
     """Solve with the options of a command, as they were given."""
 
-    def say(sentence: str) -> None:
-        if not call.json:
-            typer.echo(sentence)
-
+    said: list[str] = []
     folder = call.folder("hand-eye", file.resolve().stem)
     stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=say, **options)
-    return Outcome(report.summary(), text=report.text(), first=report.first)
+    try:
+        report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=said.append, **options)
+    except WeldcalError:
+        for sentence in said if not call.json else ():  # how the file was read is part of what a refusal says
+            typer.echo(sentence)
+        raise
+    return Outcome(report.summary(), text="\n".join([*said, report.text()]), first=report.first)
 
 
 def run_hand_eye(
@@ -277,7 +279,7 @@ def run_hand_eye(
         pairs = poses_of_arm(pairs, arm)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
-        raise InputError(f"'{file.name}' is {found.name}. Solve it with 'weldcal hand-eye {right}'.")
+        raise InputError(f"'{file.name}' is {found.name}. Solve it with '{typed(f'hand-eye {right}', file)}'.")
     config = HandEyeConfig(seed=seed)
     pictures: PictureResult | None = None
     if motions:

@@ -87,7 +87,7 @@ def _print_all(robots: list[Robot]) -> None:
         highlight=False,
     )
     screen.print(
-        "weldcal robots NAME shows one robot, joint by joint, with the source of each number.", highlight=False
+        "'weldcal robots' with a name shows one robot, joint by joint, with the source of each number.", highlight=False
     )
 
 

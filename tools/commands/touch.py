@@ -15,7 +15,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.commands.run import run_job
-from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.render import csv_text, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import TouchReport, touch_page
@@ -132,13 +131,11 @@ def run_touches(scenario: Scenario, options: RunOptions, progress: Progress) -> 
 def touches_outcome(call: Call, result: Path, touches: Path) -> Outcome:
     """What `weldcal verify --touch` prints of points in a file."""
     report = verify_touches(result, touches, call.folder("verify", touches.resolve().stem))
-    verdict = report.verdict
     return Outcome(
         report.summary(),
         values={},
         rows={name: text for name, text in report.rows.items() if name != "verdict"},
         first=report.first,
-        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )
 
 
@@ -148,14 +145,10 @@ def live_touches_outcome(call: Call, result: Path, scenario: str, robot: str, po
         scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live
     )
     found = run_touches(touching(scenario, result, points), options, call.progress)
-    report, problem = found.report, ""
-    if found.state == "held":
-        problem = found.reason
-    elif report is not None and report.verdict.verdict == DO_NOT:
-        problem = f"The verdict is: {DO_NOT}. {report.verdict.reason}"
+    report = found.report
     return Outcome(
         found.summary(),
         rows={} if report is None else report.rows,
-        problem=problem,
+        problem=found.reason if found.state == "held" else "",
         first=None if report is None else report.first,
     )

@@ -166,14 +166,7 @@ def verify(
                 word for name in of_pairs if of_pairs[name] for word in (name, shlex.quote(f"{of_pairs[name]}"))
             ),
         )
-        settled = paired.verdict
-        return Outcome(
-            paired.summary(),
-            values={},
-            rows=paired.rows(),
-            first=paired.first,
-            problem=f"The verdict is: {settled.verdict}. {settled.reason}" if settled.verdict == DO_NOT else "",
-        )
+        return Outcome(paired.summary(), values={}, rows=paired.rows(), first=paired.first)
     surplus = next((name for name, value in {**of_pairs, "--mounting": mounting}.items() if value is not None), None)
     if surplus is not None:
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
@@ -188,13 +181,12 @@ def verify(
         limit_mm=limit_mm,
         pose=pose,
     )
-    verdict, summary = report.verdict, report.summary()
+    summary = report.summary()
     return Outcome(
         summary,
         values={key: value for key, value in summary.items() if key not in ("verdict", "reason")},
         rows=report.interval_rows,
         first=report.first,
-        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )
 
 

@@ -43,6 +43,7 @@ from weldcal.tools.report.first_screen import (
     limit_tolerance,
     refused_note,
     typed,
+    verify_next,
     work_point_error,
     work_point_expected,
 )
@@ -149,9 +150,19 @@ class CalibrationReport:
         corrected = correction_note(r, self.out / RESULT_FILE)
         notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
-        n, left = len(r.poses), len(self.refused)
-        lead = f"{n - left} of {n} scans are used." if left else ""
-        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),), lead=lead)
+        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),), self._used)
+
+    @property
+    def _used(self) -> dict[str, str]:
+        """Rows: the scans that were used, the scanner's correction, and the files with the forms of robots and ROS."""
+        n, left = len(self.result.poses), [name for name, _ in self.refused]
+        names = f"; refused: {', '.join(left[:6])}{' ...' if len(left) > 6 else ''}" if left else ""
+        applied = None if self.scanner is None else self.scanner.accepted
+        scale = "" if applied is None else f"; the scanner is corrected by {1e2 * (applied.scale - 1.0):+.2f} %"
+        return {
+            "scans used": f"{n - len(left)} of {n}{names}{scale or '; the scanner is not corrected'}",
+            "UR and ROS 2": "ur_pose.script, static_transform.sh beside the report",
+        }
 
     @property
     def _remarks(self) -> list[str]:
@@ -166,14 +177,17 @@ class CalibrationReport:
 
     def _next(self, tolerance: Tolerance | None, concerns: Sequence[str]) -> Next:
         missed = tolerance is not None and not tolerance.met
-        if self.advice and (missed or self.work_point.unseen_poses < ENOUGH_UNSEEN):
-            return Next(f"{' '.join(self.advice[:2])} Then calibrate again.")
+        advice = [text for text in self.advice if not text.startswith("Stop")]
+        if advice and (missed or self.work_point.unseen_poses < ENOUGH_UNSEEN):
+            return Next(f"{' '.join(advice[:2])} Then calibrate again.")
+        if missed:
+            return Next(self.budget.sentence)
         if concerns:
             return Next(
                 "See what disturbs the scans, then verify on scans that the calibration has not seen.",
                 typed("doctor", self.out),
             )
-        return Next("Take four or more new scans, and verify with them.", typed("verify", self.out, "NEW_SCANS"))
+        return verify_next(self.out)
 
     @property
     def work_point(self) -> WorkPoint:

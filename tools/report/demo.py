@@ -30,6 +30,7 @@ from weldcal.tools.report.first_screen import (
     refused_note,
     typed,
     upper,
+    verify_next,
     work_point_error,
     work_point_expected,
 )
@@ -117,13 +118,14 @@ class DemoResult:
                 concerns=self.warnings,
                 notes=self.arm_note,
             )
-            more["pose"] = "none was found" if scenario.job.calibrate else "none was computed: X_BC is the scenario's"
             scanner = scenario.scanner
-            if (
+            if scenario.job.calibrate:
+                more["pose"] = "none was found"
+            elif (
                 isinstance(scanner, RenderedScanner)
                 and not scanner.mounting_translation_mm + scanner.mounting_rotation_deg
             ):
-                more["pose"] = "none was computed: the simulated scanner is exactly at its nominal pose"
+                more["pose"] = "the simulated scanner is exactly at its nominal pose"
             none = ExpectedError("error at the work point, 95 %", "not known", "there is no calibration")
             return FirstScreen(
                 found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
@@ -138,7 +140,7 @@ class DemoResult:
             "the expected error at the work point, one sigma,",
             1e3 * status.predicted_error_m,
             c.required_error_mm,
-            "calibration.required_error_mm, one sigma too; with 95 % probability see below",
+            "calibration.required_error_mm",
         )
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
@@ -179,7 +181,8 @@ class DemoResult:
         if self.weld is None or self.weld.error is None:
             return {}
         torch = self._torch()
-        return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
+        brief = torch.backing.partition(", in the first")[0]
+        return {"torch": f"{torch.figure} ({brief})"} if self.status.estimate is not None else {}
 
     def _torch(self) -> ExpectedError:
         """The torch's distance from the true seam."""
@@ -199,7 +202,7 @@ class DemoResult:
             if self.broken:
                 return Next(
                     "Remove the cause that is named above, and move the arm home. Then go on from the crater.",
-                    f"weldcal weld --resume {folder}",
+                    typed("weld --resume", folder),
                 )
             if self.weld is None and not self.n_scans:
                 return after_hold(self.run.ended_by_operator)
@@ -214,7 +217,7 @@ class DemoResult:
             part = self.run.cell.scenario.workpiece
             own = part is not None and part.file is not None
             return Next(f"See it again{'' if own else '; then try your own part'}.", typed("view", folder))
-        return Next("Verify with scans that the calibration has not seen.", typed("verify", folder, "NEW_SCANS"))
+        return verify_next(folder)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""

@@ -71,7 +71,7 @@ class DoctorReport:
             return (
                 f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(self.checked)}\n"
                 + self._not_shown
-                + "  Where new scans still disagree: weldcal verify RESULT NEW_SCANS"
+                + "  Where new scans still disagree, run 'weldcal verify' with the result and their folder."
             )
         lines = [
             f"doctor: {len(self.causes)} cause{'s' if len(self.causes) > 1 else ''} in {self.n} scans ({self.source})"
@@ -150,7 +150,7 @@ def _moved(c: Cause) -> tuple[str, str]:
             f"From '{c.where[1]}' on the scans agree on another camera pose than up to '{c.where[0]}':"
             f" {c.numbers['shift_mm']:.2f} mm and {c.numbers['turn_deg']:.3f} degrees apart; {_fits(c)}."
         ),
-        f"Fasten the scanner. Calibrate the later part alone (weldcal calibrate FOLDER --poses {c.where[1]}:).",
+        f"Fasten the scanner. Calibrate only the later part with 'weldcal calibrate --poses {c.where[1]}:'.",
     )
 
 
@@ -323,7 +323,10 @@ def _worn(c: Cause) -> tuple[str, str]:
 
 
 def _bent(c: Cause) -> tuple[str, str]:
-    return c.words, "After a repair measure the tool again: weldcal tool check TOOL --measure SCANS."
+    return (
+        c.words,
+        "After a repair measure the tool again: 'weldcal tool check' with its file and --measure with the scans.",
+    )
 
 
 def _held(c: Cause) -> tuple[str, str]:

@@ -82,9 +82,7 @@ USE, CARE, DO_NOT = "use it", "use with care", "do not use"
 ENOUGH_UNSEEN = 4
 """Unseen poses (scans, frames, landmarks) from which on they back a verdict; `verify` asks for as many new scans."""
 MOST_CONCERNS = 3
-NO_TOLERANCE = (
-    "No tolerance is stated, so this result cannot be judged for your job. State the allowed error with --limit-mm."
-)
+NO_TOLERANCE = "No tolerance is stated: add --limit-mm with the allowed error."
 
 
 @dataclass(frozen=True)
@@ -136,10 +134,24 @@ class ExpectedError:
 
 @dataclass(frozen=True)
 class Next:
-    """The next step: a sentence, and the command or motion that does it (empty: none)."""
+    """The next step: a sentence, and the command or motion that does it (empty: none).
+
+    A command runs as it is printed, so that it has no placeholder. ``uses``: the step relies on the result, so that it
+    is not shown beside "do not use".
+    """
 
     text: str
     command: str = ""
+    uses: bool = False
+
+
+AGAINST = Next("Remove what the verdict names, or add data that vary more. Then run the command again.")
+"""The next step in the place of one that relies on a result which is not to be used."""
+
+
+def verify_next(folder: Path | str, lead: str = "Take four or more new scans") -> Next:
+    """Return the step to judge the result in a folder with scans that are still to be taken."""
+    return Next(f"{lead}. Run '{typed('verify', folder)}' and name their folder.", uses=True)
 
 
 def typed(command: str, path: Path | str, *more: str) -> str:
@@ -149,11 +161,16 @@ def typed(command: str, path: Path | str, *more: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ShownPose:
-    """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m."""
+    """A computed pose: its symbol (X_BC), frames in words, and the transform with its translation in m.
+
+    ``sigma``: its uncertainty in words, of the position first. ``aside``: not on the brief screen.
+    """
 
     symbol: str
     words: str
     X: RigidTransform
+    sigma: str = ""
+    aside: bool = False
 
     @property
     def forms(self) -> tuple[tuple[str, str, str], ...]:
@@ -180,11 +197,13 @@ class ShownPose:
     def line(self) -> str:
         """Position and rotation vector on one line."""
         p, r = 1e3 * self.X.translation(), rotation_vector(self.X.rotation())
-        return f"{p[0]:.3f}, {p[1]:.3f}, {p[2]:.3f} mm; rotation vector {r[0]:.6f}, {r[1]:.6f}, {r[2]:.6f} rad"
+        line = f"{p[0]:.3f}, {p[1]:.3f}, {p[2]:.3f} mm; rotation vector {r[0]:.6f}, {r[1]:.6f}, {r[2]:.6f} rad"
+        return f"{line}; one sigma {self.sigma.partition('; ')[0]}" if self.sigma else line
 
     def rows(self) -> dict[str, str]:
         """Return the rows for the terminal."""
-        return pose_rows(self.X, self.symbol, self.words)
+        rows = pose_rows(self.X, self.symbol, self.words)
+        return rows | ({"one sigma": self.sigma} if self.sigma else {})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,12 +263,13 @@ class FirstScreen:
     """The first screen.
 
     `lead` is said before the verdict's reason. `more` are rows by name: other results, and what takes the place of a
-    pose or a figure that the command does not have.
+    pose or a figure that the command does not have. Its parts agree: beside "do not use" stands no step that relies on
+    the result, and not that nothing was found; beside "use it" nothing that could be wrong.
     """
 
     found: Findings
     expected: ExpectedError
-    next: Next
+    step: Next
     poses: tuple[ShownPose, ...] = ()
     more: Mapping[str, str] = field(default_factory=dict)
     lead: str = ""
@@ -270,19 +290,32 @@ class FirstScreen:
         return {USE: "good", CARE: "warn", DO_NOT: "bad"}[self.verdict]
 
     @property
+    def refusal(self) -> str:
+        """Return the sentence that ends a command with exit code 1; empty unless the result is not to be used."""
+        return f"The verdict is: {DO_NOT}. {self.reason}" if self.verdict == DO_NOT else ""
+
+    @property
+    def next(self) -> Next:
+        """The step; another one where it relies on a result that is not to be used."""
+        return AGAINST if self.step.uses and self.verdict == DO_NOT else self.step
+
+    @property
     def concerns(self) -> tuple[str, ...]:
         """At most three things that could be wrong, the gravest first; the third says how many more there are."""
-        return _first_few([*self.found.against[1:], *self.found.concerns])
+        return () if self.verdict == USE else _first_few([*self.found.against[1:], *self.found.concerns])
 
     @property
     def notes(self) -> tuple[str, ...]:
         """List at most three things that do not speak against the result; the third counts the others."""
-        return _first_few(text for text in self.found.notes if text not in self.concerns)
+        doubts = self.found.concerns if self.verdict == USE else ()  # of a verdict by another rule
+        return _first_few(text for text in (*doubts, *self.found.notes) if text not in self.concerns)
 
     @property
     def nothing(self) -> str:
         """Return the text for no concern besides the verdict's reason."""
-        return "Nothing was found." if self.verdict == USE or not self.found.against else "Nothing else was found."
+        if self.verdict == DO_NOT:
+            return "Nothing else was found."
+        return "Nothing that changes the verdict." if self.notes else "Nothing was found."
 
     def rows(self) -> dict[str, str]:
         """Return the rows for the terminal, by name; several things stand on lines of their own."""
@@ -298,20 +331,29 @@ class FirstScreen:
             rows |= {name + " " * k: text for name, text in pose.rows().items()}
         return rows
 
-    def brief(self, concerns: int, notes: int) -> dict[str, str]:
-        """The rows for a terminal that shows the result on a few lines, with so many of the concerns and notes."""
+    @property
+    def sizes(self) -> list[tuple[int, int, int, int]]:
+        """Sizes of the brief screen from the longest on: other results, sentences of the step, concerns, notes."""
+        c, n = len(self.concerns), len(self.notes)
+        texts = [(k, m) for k in range(c, min(c, 1) - 1, -1) for m in range(n, -1, -1)]
+        texts.sort(key=lambda size: (-min(size), -sum(size)))
+        steps, more = range(len(sentences(self.next.text)), 0, -1), range(len(self.more), -1, -1)
+        return [(others, number, *size) for others in more for number in steps for size in texts]
+
+    def brief(self, others: int, steps: int, concerns: int, notes: int) -> dict[str, str]:
+        """Return the rows for a terminal with few lines, in one of its ``sizes``."""
 
         def listed(texts: Sequence[str], number: int) -> str:
             shown = [f"- {first_sentence(text)}" for text in texts[:number]]
             left = len(texts) - number
-            return "\n".join(shown + ([f"- {left} more in the report"] if left > 0 else []))
+            return "\n".join(shown + ([f"- {left} more in the report"] if shown and left > 0 else []))
 
         rows = {"why": self.reason, "result": f"{self.expected.what}: {self.expected.figure}"}
-        rows |= {pose.symbol: pose.line for pose in self.poses}
-        rows |= {name: first_sentence(text) for name, text in self.more.items()}
+        rows |= {pose.symbol: pose.line for pose in self.poses if not pose.aside}
+        rows |= {name: first_sentence(text) for name, text in list(self.more.items())[:others]}
         rows |= {"could be wrong": listed(self.concerns, concerns) or self.nothing}
         rows |= {"good to know": listed(self.notes, notes)}
-        return rows | {"next": self.next.command or first_sentence(self.next.text)}
+        return rows | {"next": self.next.command or " ".join(sentences(self.next.text)[:steps])}
 
     def document(self) -> dict[str, object]:
         """Return the JSON object."""
@@ -414,9 +456,14 @@ def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
     return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
 
 
+def sentences(text: str) -> list[str]:
+    """Split a text into its sentences."""
+    return re.split(r"(?<=[.!?])\s+(?=[A-Z])", text.strip())
+
+
 def first_sentence(text: str) -> str:
     """Return the text up to the end of its first sentence."""
-    return re.split(r"(?<=[.!?])\s+(?=[A-Z])", text.strip(), maxsplit=1)[0]
+    return sentences(text)[0]
 
 
 def upper(text: str) -> str:

@@ -67,12 +67,12 @@ class HandEyeReport:
         found = Findings(
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
-        after = (
-            Next(f"To reduce the uncertainty, add a pose. {self.advice}")
-            if self.advice
-            else Next("Compare with poses that were not in the file: the target must stay where the result puts it.")
-        )
-        return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
+        after = Next(self.advice)
+        if not self.advice:
+            after = Next("Record pairs that are not in the file, and verify the result with them.", uses=True)
+        symbol = self.mounting.unknowns["X"].symbol
+        files = {"UR and ROS 2": f"{symbol}.ur_pose.script, {symbol}.static_transform.sh"}
+        return FirstScreen(found, expected, after, shown_poses(r, self.mounting), files)
 
     def summary(self) -> dict[str, object]:
         """Return the JSON object of the command."""
@@ -116,9 +116,7 @@ class HandEyeReport:
         r, m = self.result, self.mounting
         lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
         for k in r.poses:
-            sigma = np.sqrt(np.diag(r.covariance[k]))
-            mm, deg = _sigmas(1e3 * sigma[3:], 1e3 * r.extent), _sigmas(np.degrees(sigma[:3]), 57.3)
-            lines.append(f"one sigma    {m.unknowns[k].symbol}  {mm} mm   {deg} deg")
+            lines.append(f"one sigma    {m.unknowns[k].symbol}  {_sigma_words(r, k)}")
         lines += [f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():
             lines += [f"             {_held_out(held_out_used(r), 'without outliers, ')}"]
@@ -180,7 +178,7 @@ def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
 
 
 def _sigmas(values: Array, certain: float) -> str:
-    return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)
+    return ", ".join("open" if v > certain else f"{v:.3f}" for v in values)
 
 
 def held_out_used(r: HandEyeResult) -> HandEyeHeldOut:
@@ -236,9 +234,20 @@ def held_out_error(r: HandEyeResult) -> tuple[ExpectedError, float, int]:
 def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
     """Return the poses that were solved for, with their frames in words."""
     return tuple(
-        ShownPose(u.symbol, f"pose of the {u.child_words} in the {u.parent_words} frame", X)
-        for u, X in ((mounting.unknowns[k], X) for k, X in r.poses.items())
+        ShownPose(
+            u.symbol,
+            f"pose of the {u.child_words} in the {u.parent_words} frame",
+            X,
+            sigma=_sigma_words(r, k),
+            aside=u.child_words == "target",
+        )
+        for k, u, X in ((k, mounting.unknowns[k], X) for k, X in r.poses.items())
     )
+
+
+def _sigma_words(r: HandEyeResult, k: str) -> str:
+    sigma = np.sqrt(np.diag(r.covariance[k]))
+    return f"{_sigmas(1e3 * sigma[3:], 1e3 * r.extent)} mm; {_sigmas(np.degrees(sigma[:3]), 57.3)} deg"
 
 
 def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:

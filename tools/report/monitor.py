@@ -82,8 +82,8 @@ class MonitorReport:
         if self.recalibrated is not None and self.moves:
             folder = self.out / "recalibrated"
             return Next(
-                "Verify the pose after the change with new scans before you use it.",
-                typed("verify", folder, "NEW_SCANS"),
+                f"Verify the pose after the change before you use it: take new scans, run '{typed('verify', folder)}'"
+                " and name their folder."
             )
         if self.moves:
             return Next(

@@ -23,6 +23,7 @@ from weldcal.tools.report.first_screen import (
     point_covariance,
     radius_95,
     refused_note,
+    typed,
 )
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
 from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
@@ -170,10 +171,8 @@ def motion_screen(
     if tolerance is not None and not tolerance.met:
         after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
     elif r.symbol == "X_BC":
-        after = Next(
-            "Verify with scans at rest that the calibration has not seen, or watch it while the arm works.",
-            f"weldcal monitor RECORDING --calibration {out}",
-        )
+        watched = f"run '{typed('monitor --calibration', out)}' and name another recording of the flange"
+        after = Next(f"Verify with scans at rest that the calibration has not seen; or {watched}.", uses=True)
     else:
         after = Next("Record a second motion and calibrate again: the two poses should agree within their errors.")
     return FirstScreen(found, expected, after, (scanner_pose(r),))

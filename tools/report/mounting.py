@@ -158,12 +158,12 @@ class MountingReport:
         ]
         notes = [self.scanner_sentence(), *refused_note(status.refused, status.sequence)]
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
-        after = "Use the pose; calibrate again after the scanner was moved."
+        after = Next("Use the pose; calibrate again after the scanner was moved.", uses=True)
         if status.next_best is not None:
-            after = f"To reduce the uncertainty, add the pose {status.next_best.sentence()}"
+            after = Next(f"To reduce the uncertainty, add the pose {status.next_best.sentence()}")
         elif tolerance is not None and not tolerance.met:
-            after = "Add poses that are turned more and lie farther apart, and calibrate again."
-        return FirstScreen(found, expected, Next(after), shown_poses(result, self.mounting))
+            after = Next("Add poses that are turned more and lie farther apart, and calibrate again.")
+        return FirstScreen(found, expected, after, shown_poses(result, self.mounting))
 
     def scanner_sentence(self) -> str:
         """What was found of the scanner, and what the scans do not determine of it."""

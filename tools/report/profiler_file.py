@@ -20,6 +20,7 @@ from weldcal.tools.report.first_screen import (
     limit_tolerance,
     point_covariance,
     radius_95,
+    typed,
 )
 from weldcal.tools.report.pictures import OURS, error_bars, subplots, svg
 from weldcal.tools.report.render import fixed, render, sigma_rows
@@ -112,9 +113,11 @@ class ProfilerFile:
                 " rotation"
                 f" vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
             )
+        seam = typed("profiler seam --calibration", self.out)
         return Next(
-            "Map a groove with it and touch some of its points; --plan 3 proposes poses to add.",
-            f"weldcal profiler seam SCANS --calibration {self.out}",
+            f"Map a groove with it and touch some of its points: run '{seam}' and name the file of its scans; --plan 3"
+            " proposes poses to add.",
+            uses=True,
         )
 
 
@@ -150,7 +153,9 @@ class ProfilerSeam:
         tolerance = limit_tolerance(what, float("nan") if own is None else own, self.limit_mm)
         grave, notes = scan_notes(self.found)
         found = Findings(tolerance=tolerance, concerns=(*self.found.get("warnings", ()), *grave), notes=notes)
-        after = Next("Touch some points of the groove with a pointer of known length, and compare them with seam.csv.")
+        after = Next(
+            "Touch some points of the groove with a pointer of known length, and compare them with seam.csv.", uses=True
+        )
         pose = ShownPose("X_FS", f"{WORDS}, as calibrated in {self.calibration}", pose_of(self.record))
         return FirstScreen(
             found,

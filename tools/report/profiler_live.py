@@ -232,8 +232,8 @@ class ProfilerLive:
             after = after_hold(self.run.ended_by_operator)
         else:
             after = Next(
-                "Take the same scans with your own profiler and calibrate from the file.",
-                "weldcal profiler sphere FILE",
+                "Take the same scans with your own profiler, run 'weldcal profiler sphere' and name their file.",
+                uses=True,
             )
         more = {} if poses else {"pose": "none was found"}
         return FirstScreen(found_all, expected, after, tuple(poses), more)

@@ -1,7 +1,7 @@
 """The first screen of a tablet calibration and its page, from files or from a simulated visit."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -95,7 +95,7 @@ def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, objec
         f" points the pen is off by {unseen['mean']:.3f} mm on average, {unseen['max']:.3f} at most (known in"
         " simulation only)"
     )
-    return FirstScreen(first.found, first.expected, first.next, first.poses, {**first.more, "truth": truth})
+    return replace(first, more={**first.more, "truth": truth})
 
 
 def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[ExpectedError, Tolerance | None]:

@@ -215,7 +215,7 @@ def test_a_result_corrects_points_and_names_how(result: CalibrationResult, tmp_p
         corrected.correct(np.ones((5, 4)))
     file = save_result(corrected, tmp_path)
     note = correction_note(corrected, file) or ""
-    assert f"weldcal apply {file} CLOUD" in note
+    assert f"'weldcal apply {file}' and the name of a scan" in note
     assert "multiply" not in note
     call = note.split("in Python ")[1].rstrip(".")
     assert eval(call, {"weldcal": weldcal, "points": points})[0] == pytest.approx(corrected.correct(points)[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -68,8 +69,8 @@ RESULT = CalibrationResult(
 )
 
 
-def calibrate() -> Made:
-    """`calibrate` of ten scans within its tolerance, with a warning."""
+def calibration(**changes: Any) -> CalibrationReport:
+    """The report of ten scans within its tolerance, with a warning; `changes` replace its fields."""
     counts = np.arange(4, 10)
     curve = Convergence(counts, 1e-4 * np.ones((2, len(counts))))
     report = CalibrationReport(
@@ -88,6 +89,12 @@ def calibrate() -> Made:
         advice=("Add a pose near (1, 2, 3).",),
         limit_mm=2.0,
     )
+    return replace(report, **changes)
+
+
+def calibrate() -> Made:
+    """`calibrate` of ten scans within its tolerance, with a warning."""
+    report = calibration()
     return report.first, calibration_report(report, dataset="scans")
 
 

@@ -80,7 +80,7 @@ def test_at_most_three_things_could_be_wrong_the_gravest_first() -> None:
 def test_what_is_good_to_know_is_not_said_to_be_wrong() -> None:
     fine = screen(Findings(tolerance=WITHIN, unseen=8, notes=["One scan was refused.", "One scan was refused."]))
     assert fine.concerns == ()
-    assert fine.rows()["could be wrong"] == "Nothing was found."
+    assert fine.rows()["could be wrong"] == "Nothing that changes the verdict."
     assert fine.rows()["good to know"] == "- One scan was refused."
     assert fine.document()["good_to_know"] == ["One scan was refused."]
     both = screen(Findings(concerns=["First."], notes=["First.", "Second.", "Third.", "Fourth.", "Fifth."]))

@@ -95,7 +95,7 @@ def test_a_part_that_cannot_begin_a_cell_is_refused_in_a_sentence(angle: Path, t
         write_cell(tmp_path / "a", "s_groove", OwnPart(angle, (99,)))
     box = tmp_path / "box.obj"
     box.write_text(extrude(ANGLE[[0, 1, 2]], 0.0, 20.0).to_obj())
-    with pytest.raises(InputError, match=r"box.obj has no concave edge: choose edges with weldcal part"):
+    with pytest.raises(InputError, match=r"box.obj has no concave edge: choose edges with 'weldcal part"):
         write_cell(tmp_path / "b", "s_groove", OwnPart(box))
     with pytest.raises(InputError, match="--edges must be numbers with commas between them"):
         edge_numbers("12;13")

@@ -132,8 +132,9 @@ class FingerReport:
             f"of {self.touches} touches, each left out of the fit; too few for a 95 % figure. {pictures}",
         )
         after = Next(
-            "Name the finger.yaml in the tool file, and see the tag in pictures of the cell.",
-            "weldcal check-cell SCENARIO",
+            "Name the finger.yaml in the tool file; then 'weldcal check-cell' with your scenario shows whether the tag"
+            " is seen.",
+            uses=True,
         )
         return FirstScreen(found, expected, after, (), more)
 

@@ -134,7 +134,7 @@ def new(
         if part is not None and written.name == UNFINISHED:
             problem = (
                 f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
-                f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
+                f"Choose other edges from '{typed('part', part)}' and give --edges, or change {written}."
             )
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)
@@ -361,7 +361,7 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool)
     chains = [part.edges] if part.edges else [seam.joint.edges for seam in ranked(shape, tool)][:MOST_TRIED]
     if not chains:
         raise InputError(
-            f"{part.file.name} has no concave edge: choose edges with weldcal part {part.file} and give --edges."
+            f"{part.file.name} has no concave edge: choose edges with '{typed('part', part.file)}' and give --edges."
         )
     seams = ways(shape, chains[0])[0][0]
     scenario.workpiece = WorkpieceConfig(
