@@ -239,6 +239,12 @@ class SeamRecord(Message):
     left_out: tuple[tuple[float, float], ...] = ()
     weld_pass: int = 0  # 0: the root
     line: SeamCurve | None = None  # of the tip
+    begins_m: float = 0.0  # of the whole seam, at the line's start
+    reverse: bool = False  # the line runs from the seam's end to its start
+
+    def place(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where on the whole seam the arc lengths s (...) m of the line are, m."""
+        return self.begins_m + (self.line.length - s if self.reverse and self.line is not None else s)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -29,6 +29,7 @@ from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics, wire_angles
 from weldcal.welding.record.weave import MeasuredWeave, measure_weave
+from weldcal.welding.record.welded_seam import touch_numbers
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
@@ -343,14 +344,6 @@ def pass_documents(weld: WeldOutcome, passes: Sequence[WeldPass], errors: list[d
 def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
     """The ordered weave and the measured one of each seam; the mean path off the seam where a simulation knows that."""
     dwell_s, known = order.dwell_left_s + order.dwell_right_s, weld.error is not None
-    ordered = {
-        "shape": order.shape,
-        "amplitude_mm": 1e3 * order.amplitude_m,
-        "frequency_hz": order.frequency_hz,
-        "dwell_s": [order.dwell_left_s, order.dwell_right_s],
-        "bow_mm": 1e3 * order.lag_m,
-        "plane_deg": float(np.degrees(order.plane_rad)),
-    }
     mean = order.amplitude_m * (order.dwell_left_s - order.dwell_right_s) / order.period_s
     middle = mean * np.array([np.cos(order.plane_rad), np.sin(order.plane_rad)])
     measured = [
@@ -365,7 +358,19 @@ def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
         }
         for m in weld.weave
     ]
-    return {"ordered": ordered, "measured": measured}
+    return {"ordered": ordered_weave(order), "measured": measured}
+
+
+def ordered_weave(order: WeaveConfig) -> dict[str, Any]:
+    """Return what is ordered of a weave."""
+    return {
+        "shape": order.shape,
+        "amplitude_mm": 1e3 * order.amplitude_m,
+        "frequency_hz": order.frequency_hz,
+        "dwell_s": [order.dwell_left_s, order.dwell_right_s],
+        "bow_mm": 1e3 * order.lag_m,
+        "plane_deg": float(np.degrees(order.plane_rad)),
+    }
 
 
 def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
@@ -387,8 +392,8 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
 
 def weld_numbers(phase: Array) -> NDArray[np.int_]:
     """The number (N,) of the weld of each row: one begins where the tip is brought into touch again."""
-    touching = phase == PHASE_CODES[Phase.TOUCH]
-    return np.asarray(np.cumsum(touching & ~np.concatenate([[True], touching[:-1]])))
+    held = np.isin(phase, (PHASE_CODES[Phase.HELD], PHASE_CODES[Phase.BACK]))
+    return touch_numbers(phase == PHASE_CODES[Phase.TOUCH], held)
 
 
 def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
