@@ -230,7 +230,7 @@ class ScanView(Message):
     X_BC: RigidTransform | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SeamRecord(Message):
     """One plan: its seam's number, how its parts lie to each other, and the stretches (from, to) m left unwelded."""
 

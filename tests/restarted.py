@@ -45,8 +45,9 @@ from weldcal.tools.commands.weld import broken_weld, keeper_of, killed_weld, res
 from weldcal.tools.console import plain
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.weld import true_seam, weld_outcome
+from weldcal.tools.report.weld import weld_outcome
 from weldcal.welding.record.progress import Progress, load_progress
+from weldcal.welding.seam.curve import SeamCurve
 
 SIMULATED, WIRED = ("pause", "end", "power"), ("protective", "killed")
 """How a weld breaks off. Pause: an operator holds it and lets it go on. End: an operator ends it. Power: the process is
@@ -259,6 +260,7 @@ ORDER = (
     " tacks: [{from_mm: 20, to_mm: 26, height_mm: 5.5}], order: {part: P-1, operator: jd}"
 )
 SECOND_PASS = ", passes: [{lateral_mm: 1.0, vertical_mm: 4.0, reverse: true}]"
+PLAN = "plan.npy"
 _TICK = struct.Struct("iid3d")
 
 
@@ -285,6 +287,9 @@ def logged_run(
         if now.cell.diagram.GetOutputPort("process_on").Eval(context)[0] < 0.5:
             return
         torch = now.cell.diagram.GetOutputPort("torch").Eval(context)[:3]
+        if not (folder.parent / PLAN).exists():
+            line = now.cell.job.planned_seam(now.root).records[0].line
+            np.save(folder.parent / PLAN, line.position(np.linspace(0.0, line.length, 200)))
         with (folder.parent / "truth.bin").open("ab") as file:
             file.write(_TICK.pack(run, now.command.weld_pass, now.seconds, *torch))
         state = now.cell.job.servo_report(now.root).state
@@ -318,10 +323,11 @@ def logged_run(
 
 
 def burned(folder: Path, passes: int) -> list[list[tuple[float, float]]]:
-    """Where the arc burned along the true seam in each pass, mm: from and to of each piece, joined where they meet."""
-    station = build_cell(ordered_weld(passes), 0).station
-    seam = true_seam(station.truth)
-    assert seam is not None
+    """Where the true arc burned in each pass, mm: from and to of each piece, joined where they meet.
+
+    Places are those along the first run's plan, for a scan does not locate the start of a groove to 0.5 mm.
+    """
+    seam = SeamCurve.from_points(np.load(folder.parent / PLAN))
     ticks = list(_TICK.iter_unpack((folder.parent / "truth.bin").read_bytes()))
     found = []
     for number in range(passes):

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from tests.places import ROOT
+from weldcal.models.errors import InputError
 from weldcal.models.files import write_apart
 from weldcal.systems.jobs.weld.progress_keeper import RESTART, sha256_of
 from weldcal.systems.recording.scenario_files import packed
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.welding.record.progress import Progress
+from weldcal.tools.cli.result_folder import RUNNING
+from weldcal.tools.commands.weld import killed_weld
+from weldcal.welding.record.progress import Progress, Stretch
 
 
 @pytest.fixture
@@ -75,9 +82,46 @@ def test_what_no_single_crater_describes_is_not_resumed(tmp_path: Path, welding:
         assert refused in resumed(tmp_path)
 
 
-def test_a_weld_whose_process_was_killed_goes_on() -> None:
+def harness(*arguments: str) -> str:
+    """What the harness prints."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.restarted", "1", "4", "power"], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "-m", "tests.restarted", *arguments], capture_output=True, text=True, cwd=ROOT
     )
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]
-    assert "1 stops, 0 bad, 0 arcs without a question" in done.stdout
+    return done.stdout
+
+
+def test_a_weld_whose_process_was_killed_goes_on() -> None:
+    assert "1 stops, 0 bad, 0 arcs without a question" in harness("1", "4", "power")
+
+
+@pytest.mark.parametrize(("kind", "times"), [("sigint", 1), ("kill", 1), ("power", 1), ("pause", 2)])
+def test_the_record_states_each_piece_and_what_ended_it(kind: str, times: int) -> None:
+    """The union of its pieces is where the true arc burned, and JSON, CSV and pages agree; the second weld has two passes."""
+    assert f"{times} interruptions, {times} records right" in harness("record", str(times), "0", kind)
+
+
+def test_a_folder_says_how_far_a_killed_weld_came(broken: Path) -> None:
+    stretch = Stretch(seam=0, piece=0, run=0, from_m=0.0, to_m=0.045, done=False, time="2026-11-27T10:00:00+00:00")
+    state(broken, stretches=(stretch,), p_BCrater=np.zeros(3)).write(broken)
+    assert "At 45 mm of seam 1 this run was cut off: power was lost" in killed_weld(broken), (
+        "the computer started later"
+    )
+    record = json.loads((broken / "record.json").read_text())
+    assert [(p["from_mm"], p["to_mm"], p["run"]) for p in record["pieces"]] == [(0.0, 45.0, 1)]
+    assert "the arc broke off at 45 mm in run 1" in (broken / "record.html").read_text()
+    shown = CliRunner().invoke(app, ["view", str(broken), "--no-browser"])
+    assert (shown.exit_code, shown.stdout.strip()) == (0, str(broken / "record.html"))
+    assert f"Go on with weldcal weld --resume {broken}" in " ".join(shown.stderr.split())
+    later = replace(stretch, time=datetime.now(UTC).isoformat())
+    state(broken, stretches=(later,), p_BCrater=np.zeros(3)).write(broken)
+    assert "At 45 mm of seam 1 this run was killed. Go on with" in killed_weld(broken)
+    (broken / RUNNING).write_text(f"{os.getppid()}\n")
+    with pytest.raises(InputError, match="still runs"):
+        killed_weld(broken)
+
+
+def test_before_its_first_arc_a_killed_weld_has_no_record(broken: Path) -> None:
+    shown = CliRunner().invoke(app, ["view", str(broken), "--no-browser"])
+    assert shown.exit_code == 1
+    assert "Before its first arc this run was killed. Go on with" in " ".join(shown.stderr.split())

@@ -229,7 +229,7 @@ class DashboardSource:
         }
 
     def _left_s(self, moment: Moment) -> float | None:
-        """Seconds of the wall clock that are left, about, at the pace so far, or at the slower one that was asked for."""
+        """Seconds of the wall clock that are left, about, at the pace so far or at the slower one asked for."""
         left = left_s(self.facts, moment, self._share)
         slower = 1.0 / self.operator.pace if self.operator.pace else 0.0
         so_far = self._worked_s / moment.time if self._worked_s > PACE_OVER_S else min(1.0, slower or 1.0)

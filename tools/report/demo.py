@@ -44,9 +44,8 @@ from weldcal.tools.report.weld import (
     weave_document,
 )
 from weldcal.tools.report.weld_record import PartRecord
-from weldcal.welding.record.process import PathError, path_error
+from weldcal.welding.record.process import PathError
 from weldcal.welding.record.weld_log import heat_summary
-from weldcal.welding.servo.state import Phase
 
 ARM_NOTE_M = 1e-4  # the torch's mean error that welds are to keep
 
@@ -251,12 +250,9 @@ class DemoResult:
                 found["seams"] = seams
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
-        if self.weld is not None and self.weld.speed is not None:
-            found["torch_speed_cv"] = self.weld.speed.cv
-            heat = None if self.record is None else heat_summary(self.record.log)
-            found["heat_input_kJ_mm"] = None if heat is None else heat[0]
         if self.record is not None:
-            found |= self.record.summary() | {"welded_mm": self.record.welded_mm}
+            heat = heat_summary(self.record.log)
+            found |= self.record.summary() | {"heat_input_kJ_mm": None if heat is None else heat[0]}
         if self.weld is not None and self.weld.weave:
             found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
         if self.weld is not None:
@@ -352,7 +348,6 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         scenario_name=Path(result.options.scenario).stem,
         status=status,
         weld=weld,
-        tip_error_mm=None if weld is None else 1e3 * tip_error(weld),
         pictures=pictures,
         welded=[name.removeprefix("seam_") for name in pictures if name.startswith("seam_")],
         planned=_planned(result),
@@ -441,11 +436,3 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     plain(axes, "scans used", "error, mm")
     picture.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     return svg(picture)
-
-
-def tip_error(weld: WeldOutcome) -> float:
-    """Mean distance (m) sideways between the felt tip line and the true seam while the servo tracked."""
-    felt = weld.log.telemetry["phase"] == list(Phase).index(Phase.TRACK)
-    if weld.true_seam is None or not felt.any():
-        return float("nan")
-    return path_error(weld.log.p_BTip[felt], weld.true_seam).mean_m

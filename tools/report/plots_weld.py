@@ -338,7 +338,7 @@ def _not_steering(axes: Axes, trace: WeldTrace) -> None:
 
 def weld_traces(weld: WeldOutcome, cell: Cell[WeldJob], root: Context) -> dict[str, WeldTrace]:
     """The weld for the pictures by the names of its seams and passes, such as 1 and 1_pass_2."""
-    plans = cell.job.planned_seam(root).records or (SeamRecord(0, line=weld.planned),)
+    plans = cell.job.planned_seam(root).records or (SeamRecord(seam=0, line=weld.planned),)
     parts, passes = welds(weld.log)[: len(plans)], cell.scenario.welding.later_passes()
     lit = [k for k, part in enumerate(parts) if (part & weld.log.torch_on).any()]
     errors = dict(zip(lit, weld.seams, strict=True)) if len(lit) == len(weld.seams) else {}
@@ -347,22 +347,23 @@ def weld_traces(weld: WeldOutcome, cell: Cell[WeldJob], root: Context) -> dict[s
         of_seam.setdefault((plan.seam, plan.weld_pass), []).append(k)
     found = {}
     for (seam, number), of_it in of_seam.items():
-        true, last = true_seam(cell.station.truth, seam), plans[of_it[-1]]
+        true = true_seam(cell.station.truth, seam)
         if true is not None and number:
             true = true.raised(passes[number - 1].vertical_m, passes[number - 1].lateral_m)
         s = np.full(len(weld.log.time), np.nan)
         for k in of_it:
             s[parts[k]] = plans[k].place(weld.log.telemetry["s_torch"][parts[k]])
-        trace = weld_trace(weld, cell.job.servo_config, s, [errors[k] for k in of_it if k in errors])
+        of_plan = weld.plan_error if of_it[-1] == len(parts) - 1 and not number else None
+        off = ([of_plan] if of_plan else [], [errors[k] for k in of_it if k in errors])
+        trace = weld_trace(weld, cell.job.servo_config, s, off)
         if len(trace.s) > 1:
-            trace = replace(trace, planned=_line(last.line), true=_line(true))
-            of_plan = trace.plan_error if last is plans[len(parts) - 1] and not number else None
-            found[f"{seam + 1}" + f"_pass_{number + 1}" * bool(number)] = replace(trace, plan_error=of_plan)
+            name = f"{seam + 1}" + f"_pass_{number + 1}" * bool(number)
+            found[name] = replace(trace, planned=_line(plans[of_it[-1]].line), true=_line(true))
     return found
 
 
-def weld_trace(weld: WeldOutcome, config: ServoConfig, place: Array, torch_errors: Sequence[PathError]) -> WeldTrace:
-    """Return the weld for the pictures where it has a place (N,) m along the seam.
+def weld_trace(weld: WeldOutcome, config: ServoConfig, place: Array, off: Sequence[Sequence[PathError]]) -> WeldTrace:
+    """Return the weld for the pictures where it has a place (N,) m along the seam; `off`: errors of plan and torch.
 
     y of the base is drawn to the right, as in the cell.
     """
@@ -371,7 +372,7 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig, place: Array, torch_error
     along = np.outer(np.nan_to_num(named["s_torch"]), [1.0, 0.0, 0.0])  # without the swings of a weave
     speed = speed_along(log.time, along if config.weave.amplitude_m else log.p_BTorch)
     errors: list[tuple[Array, Array, Array] | None] = []
-    for parts in ([] if weld.plan_error is None else [weld.plan_error], torch_errors):
+    for parts in off:
         s, left, up = (np.concatenate([[], *(getattr(e, n) for e in parts)]) for n in ("s", "lateral", "height"))
         errors.append((broken(s, np.flatnonzero(np.abs(np.diff(s)) > APART_M) + 1), left, up) if parts else None)
     legs = np.flatnonzero(np.diff(log.time[keep]) > NEXT_SEAM_S) + 1

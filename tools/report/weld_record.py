@@ -39,10 +39,11 @@ from weldcal.welding.record.welded_seam import (
     RECORD_COLUMNS,
     SET,
     UNKNOWN,
-    Piece,
+    ArcPiece,
     Spread,
     WeldedSeam,
     arc_pieces,
+    evenness,
     ordered,
     record_row,
     seam_rows,
@@ -79,7 +80,7 @@ class PartRecord:
     log: WeldRecord
     seams: tuple[WeldedSeam, ...]
     plots: dict[tuple[int, int], bytes]  # of the arc, by the numbers of seam and pass from 1
-    pieces: Sequence[Piece] = ()
+    pieces: Sequence[ArcPiece] = ()
     lost: tuple[str, ...] = ()
     own: WeldRecord | None = None
     run: int = 1
@@ -106,12 +107,11 @@ class PartRecord:
         return sum(seam.welded_mm for seam in self.seams)
 
     def piece_rows(self) -> list[tuple[str, ...]]:
-        """Rows of the pages: seam, run, from, to, overlap, start, end, how it ended."""
+        """Rows of the pages: seam, run, from, to, how it ended, overlap, start, end."""
         return [
             (
-                *(p.name, str(p.run), *(fixed(mm, 1) for mm in (p.from_mm, p.to_mm, p.overlap_mm))),
+                *(p.name, str(p.run), fixed(p.from_mm, 1), fixed(p.to_mm, 1), p.ended, fixed(p.overlap_mm, 1)),
                 *(at.replace("T", " ").partition(".")[0] for at in (p.start, p.end)),
-                p.ended,
             )
             for p in self.pieces
         ]
@@ -123,8 +123,7 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name, 2)}, and the limit is"
-            f" {_limit(self.order, name)}."
+            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name)}, and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
@@ -132,7 +131,9 @@ class PartRecord:
     def summary(self) -> dict[str, object]:
         """What `--json` holds of the record."""
         order = {} if self.order.empty else {"order": self.order.document(), "outside_limits": self.outside}
-        return order | {"arc_mm": [seam.arc_mm for seam in self.seams], "pieces": [asdict(p) for p in self.pieces]}
+        weld = {"torch_speed_cv": evenness(self.log), "welded_mm": self.welded_mm}
+        arcs = {"arc_mm": [seam.arc_mm for seam in self.seams], "pieces": [asdict(p) for p in self.pieces]}
+        return order | arcs | (weld if self.seams else {})
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
@@ -143,39 +144,26 @@ class PartRecord:
         found: list[tuple[str, ...]] = []
         outside = seam.outside(self.order.limits)
         for name, (words, unit, digits) in _WORDS.items():
-            limit = _limit(self.order, name)
+            limit, value = _limit(self.order, name), _spread(seam, name)
             verdict = "" if limit == "–" else "outside" if name in outside else "within"
-            mean = fixed(_spread(seam, name).mean, digits)
-            if mean == limit == "–":  # neither known nor ordered
-                continue
-            found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+            if math.isfinite(value.mean) or limit != "–":  # known, or ordered
+                found.append(_row(f"{words}, {unit}", value, digits, limit, verdict))
         orders = self.log.settings.get("angles") or []
         order = (orders[seam.seam - 1] if seam.weld_pass == 1 and seam.seam <= len(orders) else None) or {}
         for name, value in seam.angles.items():
             wanted = "–" if order.get(name) is None else " to ".join(f"{v:g}" for v in np.ravel(order[name]))
-            between = f"{fixed(value.least, 1)} to {fixed(value.most, 1)}"
-            found.append((f"{name[:-4].replace('_', ' ')}, deg", between, fixed(value.mean, 1), wanted, ""))
-        return found + self._ordered_rows(seam)
-
-    def _ordered_rows(self, seam: WeldedSeam) -> list[tuple[str, ...]]:
-        """Weave, offsets of a pass and tacks of a seam, as ordered and as measured."""
-        order, found = ordered(self.log, (seam.seam - 1, seam.weld_pass - 1)), []
+            found.append(_row(f"{name[:-4].replace('_', ' ')}, deg", value, 1, wanted))
+        order = ordered(self.log, (seam.seam - 1, seam.weld_pass - 1))
         if weave := order.get("weave"):
             for key, words in (("amplitude_mm", f"weave ({weave['shape']}), mm"), ("frequency_hz", "weave, Hz")):
-                measured = fixed((seam.weave or {}).get(key, math.nan), 2)
-                found.append((words, "", measured, fixed(weave[key], 2), ""))
+                found.append(_row(words, Spread(mean=(seam.weave or {}).get(key, math.nan)), 2, fixed(weave[key], 2)))
         if seam.weld_pass > 1:
             offsets = f"{order['lateral_mm']:g} and {order['vertical_mm']:g}"
-            found.append(("pass, to the left and up, mm", "", "–", offsets, ""))
+            found.append(_row("pass, to the left and up, mm", Spread(), 1, offsets))
         for tack in seam.tacks:
-            for key, words, digits in (
-                ("travel_angle_deg", "travel angle, deg", 1),
-                ("path_mm", _WORDS["path_mm"][0], 2),
-            ):
-                value = tack[key]
-                between = f"{fixed(value.least, digits)} to {fixed(value.most, digits)}"
-                name = f"tack at {tack['from_mm']:g} to {tack['to_mm']:g} mm: {words}"
-                found.append((name, between, fixed(value.mean, digits), "–", ""))
+            where = f"tack at {tack['from_mm']:g} to {tack['to_mm']:g} mm"
+            found.append(_row(f"{where}: travel angle, deg", tack["travel_angle_deg"], 1))
+            found.append(_row(f"{where}: {_WORDS['path_mm'][0]}, mm", tack["path_mm"], 2))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -236,18 +224,12 @@ class PartRecord:
         if ended not in ("", DONE) or not seams:
             tone, judged = "bad", "fail, the weld is not complete"
         who = f"Part {self.order.part or 'not named'}, operator {self.order.operator or 'not named'}"
-        cards = []
-        for seam in self.seams:
-            heat, pieces = seam.figures["heat_input_kJ_mm"].mean, [p for p in self.pieces if p.name == seam.name]
-            note = f"in {fixed(seam.arc_s, 1)} s and {len(pieces)} piece{'' if len(pieces) == 1 else 's'}"
-            note += f"; heat input {heat:.2f} kJ/mm ({_SOURCES[seam.arc_values]})" if math.isfinite(heat) else ""
-            cards.append((f"Seam {seam.name}, welded", fixed(seam.welded_mm, 0), "mm", note))
         return render(
             "weld_record.html.j2",
             record=self,
             order=self.order,
             plots=self.plots,
-            cards=cards,
+            sources=_SOURCES,
             written=written.replace("T", " ").replace("+00:00", " UTC"),
             simulated=self.log.settings.get("robot") == "simulated",
             tone=tone,
@@ -421,9 +403,9 @@ def run_log(folder: Path, number: int) -> Path:
     return folder / CSV_NAME.replace(".", f"-{number}.")
 
 
-def _lost_piece(one: Stretch, lost: Sequence[Stretch], ends: Sequence[str]) -> Piece:
+def _lost_piece(one: Stretch, lost: Sequence[Stretch], ends: Sequence[str]) -> ArcPiece:
     last = one is [other for other in lost if other.run == one.run][-1]
-    return Piece(
+    return ArcPiece(
         seam=one.seam + 1,
         weld_pass=one.weld_pass + 1,
         run=one.run + 1,
@@ -435,18 +417,20 @@ def _lost_piece(one: Stretch, lost: Sequence[Stretch], ends: Sequence[str]) -> P
     )
 
 
+def _row(words: str, value: Spread, digits: int, wanted: str = "–", verdict: str = "") -> tuple[str, ...]:
+    """A row of the pages: the figure, least to largest value, mean, what was ordered, verdict."""
+    between = f"{fixed(value.least, digits)} to {fixed(value.most, digits)}" if math.isfinite(value.least) else "–"
+    return words, between, fixed(value.mean, digits), wanted, verdict
+
+
 def _spread(seam: WeldedSeam, name: str) -> Spread:
     return seam.figures[name] if name in RANGES else seam.path_mm
 
 
-def _known(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
-    known = math.isfinite(_spread(seam, name).mean)
-    return f"{_range(seam, name, more_digits)} {_WORDS[name][1]}" if known else "not known"
-
-
-def _range(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
-    value, digits = _spread(seam, name), _WORDS[name][2] + more_digits
-    return f"{fixed(value.least, digits)} to {fixed(value.most, digits)}"
+def _known(seam: WeldedSeam, name: str) -> str:
+    value, (_, unit, digits) = _spread(seam, name), _WORDS[name]
+    between = f"{fixed(value.least, digits + 2)} to {fixed(value.most, digits + 2)} {unit}"
+    return between if math.isfinite(value.mean) else "not known"
 
 
 def _limit(order: WeldOrder, name: str) -> str:

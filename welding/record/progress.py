@@ -70,7 +70,6 @@ class Progress:
         stretches: that are welded, in order.
         seam, piece: numbers from 0 of what is welded next, or again from its crater; done: nothing is.
         p_BCrater, p_BBegin, felt, X_BP, sigma_m: see Restart.
-        X_BC: (4, 4), pose of the scanner; None: not known.
     """
 
     scenario: str
@@ -87,22 +86,14 @@ class Progress:
     felt: Array | None = None
     X_BP: Array | None = None
     sigma_m: float = math.nan
-    X_BC: Array | None = None
 
     def restart(self, overlap_m: float) -> Restart:
         """Where the weld goes on."""
         last = self.stretches[-1] if self.stretches and self.p_BCrater is not None else None
-        return Restart(
-            crater_m=math.nan if last is None else last.to_m,
-            seam=self.seam,
-            piece=self.piece,
-            p_BCrater=self.p_BCrater,
-            p_BBegin=self.p_BBegin,
-            felt=self.felt,
-            X_BP=self.X_BP,
-            sigma_m=self.sigma_m,
-            overlap_m=overlap_m,
-        )
+        same = {
+            name: getattr(self, name) for name in ("seam", "piece", "p_BCrater", "p_BBegin", "felt", "X_BP", "sigma_m")
+        }
+        return Restart(**same, overlap_m=overlap_m, crater_m=math.nan if last is None else last.to_m)
 
     def settled(self) -> Self:
         """The progress with the end of a last run that nobody saw: whether its computer was started again after it."""
@@ -146,7 +137,7 @@ class Progress:
 
 
 _LAST_LINES = 20  # a choice: a loss of power may damage the last ones
-_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
+_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4)}
 
 
 def load_progress(folder: Path) -> Progress:

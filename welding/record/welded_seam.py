@@ -79,11 +79,10 @@ class WeldedSeam:
             found.append("path_mm")
         return tuple(found)
 
-    def joined(self, pieces: "Sequence[Piece]") -> Self:
+    def joined(self, pieces: "Sequence[ArcPiece]") -> Self:
         """The same with the places of all pieces of its pass; those of lost logs included."""
         where = tuple((p.from_mm, p.to_mm) for p in pieces if (p.seam, p.weld_pass) == (self.seam, self.weld_pass))
-        known = all(map(math.isfinite, np.ravel(where)))
-        return replace(self, arc_mm=where, welded_mm=length_mm(where)) if known else self
+        return replace(self, arc_mm=where, welded_mm=length_mm(where))
 
 
 Numbers = tuple[int, int]
@@ -91,7 +90,7 @@ Numbers = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Piece:
+class ArcPiece:
     """A piece of a seam on which the arc burned without a break.
 
     Attributes:
@@ -127,7 +126,7 @@ def length_mm(pieces: Iterable[tuple[float, float]]) -> float:
     return total
 
 
-def arc_pieces(record: WeldRecord, plans: Sequence[Numbers]) -> list[Piece]:
+def arc_pieces(record: WeldRecord, plans: Sequence[Numbers]) -> list[ArcPiece]:
     """The pieces of a weld log, in the order of time; settings "arcs" hold what the log's columns do not."""
     on = record.torch_on
     number = np.cumsum(on & ~np.concatenate([[False], on[:-1]])) - 1
@@ -138,7 +137,7 @@ def arc_pieces(record: WeldRecord, plans: Sequence[Numbers]) -> list[Piece]:
             s, arc = place[burn], arcs[number[burn[0]]] if number[burn[0]] < len(arcs) else {"run": 1}
             ends = (float(s.min()), float(s.max()))
             back = bool(s[-1] < s[0])
-            piece = Piece(seam=seam + 1, weld_pass=weld_pass + 1, from_mm=ends[back], to_mm=ends[not back], **arc)
+            piece = ArcPiece(seam=seam + 1, weld_pass=weld_pass + 1, from_mm=ends[back], to_mm=ends[not back], **arc)
             found.append((burn[0], piece))
     return [piece for _, piece in sorted(found, key=lambda one: int(one[0]))]
 
@@ -153,9 +152,17 @@ def travel_speed(record: WeldRecord) -> Array:
     return np.where(np.isfinite(record["travel_speed_m_s"]), record["travel_speed_m_s"], record["torch_speed_m_s"])
 
 
-def with_overlaps(pieces: Sequence[Piece]) -> list[Piece]:
+def evenness(record: WeldRecord) -> float:
+    """Standard deviation of the travel speed over its mean, by length; 0 where the torch stood still."""
+    v = travel_speed(record)[record.arc]
+    total = float(v.sum())
+    mean = float(v @ v) / total if total else 0.0
+    return float(np.sqrt((v - mean) ** 2 @ v / total)) / mean if mean else 0.0
+
+
+def with_overlaps(pieces: Sequence[ArcPiece]) -> list[ArcPiece]:
     """The pieces with the length of each that was welded before."""
-    found: list[Piece] = []
+    found: list[ArcPiece] = []
     for piece in pieces:
         before = [(p.from_mm, p.to_mm) for p in found if p.name == piece.name]
         here = (piece.from_mm, piece.to_mm)

@@ -60,7 +60,7 @@ class ProgressKeeper:
         self._folder, self._files, self._progress = folder, files, begun
         self._from_m, self._to_m, self._at, self._time = math.nan, -math.inf, -math.inf, -math.inf
         self._plan, self._ended, self._lit = (0, 0, 0, 0), (0, 0, 0, 0), False
-        self._line_on, self._begun = SeamRecord(0), ""
+        self._line_on, self._begun = SeamRecord(seam=0), ""
         self._slot: tuple[Progress, WeldingState | None] | None = None
         self._state: WeldingState | None = None
         self._line, self._line_m = "", -math.inf
@@ -79,10 +79,6 @@ class ProgressKeeper:
         phase = job.command(root).phase
         if not self._threads:
             if phase in ("confirm", "approach_above"):
-                stated = run.cell.scenario.job.X_BC
-                X_BC = job.calibration_status(root).X_BC or (None if stated is None else stated.pose())
-                if X_BC is not None:
-                    self._progress = replace(self._progress, X_BC=X_BC.GetAsMatrix4())
                 work = {"progress": self._write, "craters": self._append}
                 self._threads = tuple(threading.Thread(target=w, name=n, daemon=True) for n, w in work.items())
                 for thread in self._threads:
@@ -95,7 +91,7 @@ class ProgressKeeper:
             return
         if key != self._plan:
             self._plan, self._from_m, self._to_m, self._at = key, math.nan, -math.inf, -math.inf
-            self._line_on = (SeamRecord(0, line=planned.seam, begins_m=planned.begins_m), *planned.records)[-1]
+            self._line_on = (SeamRecord(seam=0, line=planned.seam, begins_m=planned.begins_m), *planned.records)[-1]
             self._line_m = -math.inf
         state = report.state
         lit = phase == "weld" and report.torch_on and state is not None and state.arc_seen

@@ -183,7 +183,7 @@ def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: Wel
         assert state is not None
         felt = felt_line(state, TIP_AHEAD * planning.tool.chord_m)
     last, order = root.records[-1], planning.passes[number - 1]
-    record = SeamRecord(last.seam, weld_pass=number, begins_m=root.begins_m, reverse=order.reverse)
+    record = SeamRecord(seam=last.seam, weld_pass=number, begins_m=root.begins_m, reverse=order.reverse)
     plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
     try:
         seam, way, along = planning.pass_way(felt, number, root.X_BP)
@@ -224,7 +224,7 @@ def plan_seam(
         )
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
-    record, more = SeamRecord(planning.number), False
+    record, more = SeamRecord(seam=planning.number), False
     kept = (*views, ScanView(scan, X_BC)) if planning.keeps_scan else ()
     try:
         found = plan_root_anyhow(
@@ -235,7 +235,7 @@ def plan_seam(
             eyes if views else eyes[0],
             planning.arm.up,
         )
-        record = SeamRecord(planning.number, found.fit_up)
+        record = SeamRecord(seam=planning.number, fit_up=found.fit_up)
         if found.fit_up is not None and isinstance(planning.workpiece, Part):
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = whole = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
@@ -464,7 +464,7 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         **way.reached,
         along=along,
         felt_line=None if seam is drawn else drawn,
-        records=(*planning.earlier, SeamRecord(planning.number, line=seam)),
+        records=(*planning.earlier, SeamRecord(seam=planning.number, line=seam)),
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -472,7 +472,7 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
-    records = (*planning.earlier, SeamRecord(planning.number))
+    records = (*planning.earlier, SeamRecord(seam=planning.number))
     try:
         whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)

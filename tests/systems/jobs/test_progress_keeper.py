@@ -33,7 +33,7 @@ STITCHES = "welding: {stitch: {on_mm: 40, off_mm: 40, order: middle_out}}"  # 80
 def test_only_the_broken_stitch_begins_before_its_crater(piece: int, begins_mm: float, ends_mm: float) -> None:
     restart = Restart(seam=0, piece=1, p_BCrater=np.array([0.025, 1e-4, 0.0]), p_BBegin=np.array([0.0005, 0.0, 0.0]))
     order = replace(planning(STITCHES), piece=piece, restart=restart)
-    order, line, _, _ = stitch_piece(order, SEAM, SeamRecord(0))
+    order, line, _, _ = stitch_piece(order, SEAM, SeamRecord(seam=0))
     order, line, down_m, again = gone_on(order, line, SEAM, None, 0.0, None)
     assert 1e3 * again["begins_m"] == pytest.approx(begins_mm, abs=0.01)
     assert 1e3 * line.position(line.length)[0] == pytest.approx(ends_mm, abs=0.01)
@@ -90,12 +90,10 @@ class Weld:
             command=lambda _: SimpleNamespace(phase=phase),
             servo_report=lambda _: report,
             planned_seam=lambda _: planned,
-            calibration_status=lambda _: SimpleNamespace(X_BC=None),
             travel=SimpleNamespace(order=(1, 0)),
             passes=1,
         )
-        scenario = SimpleNamespace(job=SimpleNamespace(X_BC=None))
-        cell = SimpleNamespace(job=job, scenario=scenario, station=None)
+        cell = SimpleNamespace(job=job, scenario=None, station=None)
         command = SimpleNamespace(seam=seam, piece=piece, weld_pass=0)
         run = SimpleNamespace(cell=cell, root=None, command=command, seconds=self.seconds, interrupted=None)
         self.keeper.look(cast(Any, run))

@@ -21,7 +21,7 @@ from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.weld_log import NAMES, WeldRecord, load_weld_log, weld_log_texts
 from weldcal.welding.record.welded_seam import (
     RECORD_COLUMNS,
-    Piece,
+    ArcPiece,
     WeldedSeam,
     arc_pieces,
     seam_rows,
@@ -101,7 +101,7 @@ def test_what_is_welded_twice_counts_once() -> None:
     first.settings["arcs"] = [{"run": 1, "ended": "killed"}]
     last.settings["arcs"] = [{"run": 3, "start": "a", "end": "b"}]
     joined = last.after(first)
-    lost = Piece(seam=1, weld_pass=1, run=2, from_mm=32.0, to_mm=60.0, ended="killed")
+    lost = ArcPiece(seam=1, weld_pass=1, run=2, from_mm=32.0, to_mm=60.0, ended="killed")
     pieces = with_overlaps(sorted([lost, *arc_pieces(joined, [(0, 0), (0, 0)])], key=lambda piece: piece.run))
     assert [(p.run, *np.round((p.from_mm, p.to_mm, p.overlap_mm), 6)) for p in pieces] == [
         (1, 0.0, 40.0, 0.0), (2, 32.0, 60.0, 8.0), (3, 100.0, 52.0, 8.0)
