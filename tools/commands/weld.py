@@ -43,7 +43,7 @@ from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.tools.report.weld_record import part_record, run_log, weld_record
-from weldcal.welding.record.progress import KILLED, POWER, PROGRESS_NAME, ProgressError, load_progress
+from weldcal.welding.record.progress import KILLED, POWER, ProgressError, load_progress
 from weldcal.welding.record.progress import Progress as WeldProgress
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.seam.restart import Restart
@@ -110,13 +110,14 @@ def killed_weld(folder: Path) -> str:
     """Write the record of a weld whose last run was killed; how far it came and how to go on, "" for any other folder.
 
     Raises:
-        InputError: the weld still runs, or its files are damaged.
+        InputError: the weld still runs.
     """
-    if not (folder / PROGRESS_NAME).is_file():
+    try:
+        progress = load_progress(folder).settled()
+    except ProgressError:  # there is none, or one of another version
         return ""
     if (process := writer(folder)) is not None:
         raise InputError(f"The weld in '{folder}' still runs (process {process}): wait until it has ended.")
-    progress = load_progress(folder).settled()
     if progress.done or progress.ends[-1] not in (KILLED, POWER):
         return ""
     scenario, here = load_scenario(str(folder / RESTART / SCENARIO)), "Before its first arc"

@@ -40,8 +40,8 @@ from weldcal.tools.report.weld import (
     WeldOutcome,
     felt_seams,
     fit_up_document,
+    ordered_weave,
     pass_documents,
-    weave_document,
 )
 from weldcal.tools.report.weld_record import PartRecord
 from weldcal.welding.record.process import PathError
@@ -253,8 +253,8 @@ class DemoResult:
         if self.record is not None:
             heat = heat_summary(self.record.log)
             found |= self.record.summary() | {"heat_input_kJ_mm": None if heat is None else heat[0]}
-        if self.weld is not None and self.weld.weave:
-            found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
+        if self.record is not None and (order := self.run.cell.job.servo_config.weave).amplitude_m:
+            found["weave"] = {"ordered": ordered_weave(order), "measured": self._weaves()}
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
@@ -278,6 +278,17 @@ class DemoResult:
                 [1e3 * a, 1e3 * b] for r in {r.seam: r for r in records}.values() for a, b in r.left_out
             ]
         found |= self.run.timing()
+        return found
+
+    def _weaves(self) -> list[dict[str, float | None]]:
+        """The measured weave of each seam and pass; where a simulation knows it, how far its mean path is off."""
+        errors = {} if self.weld is None else dict(zip(self.weld.plans, self.weld.seams, strict=True))
+        found: list[dict[str, float | None]] = []
+        for seam in () if self.record is None else self.record.seams:
+            off = errors.get((seam.seam - 1, seam.weld_pass - 1))
+            mean_mm = None if off is None else 1e3 * math.hypot(off.lateral.mean(), off.height.mean())
+            if seam.weave is not None:
+                found.append({"seam": seam.seam, "pass": seam.weld_pass, **seam.weave, "mean_path_mm": mean_mm})
         return found
 
     def calibration_summary(self) -> dict[str, object]:

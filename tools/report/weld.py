@@ -28,7 +28,6 @@ from weldcal.tools.report.render import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
 from weldcal.welding.record.process import PathError, path_error, wire_angles
-from weldcal.welding.record.weave import MeasuredWeave, measure_weave
 from weldcal.welding.record.welded_seam import touch_numbers
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
@@ -94,7 +93,6 @@ class WeldOutcome:
     error: PathError | None  # torch while the arc burned
     plan_error: PathError | None  # of the newest plan, that of the last seam
     seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
-    weave: tuple[MeasuredWeave | None, ...] = ()  # of each seam, where a weave was ordered
     plans: tuple[tuple[int, int], ...] = ()  # numbers of seam and pass of each of `seams`, from 0
 
 
@@ -260,7 +258,7 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, plan_error=plan_error)
     weave, passes = cell.job.servo_config.weave, cell.scenario.welding.later_passes()
     plans = dict(enumerate((record.seam, record.weld_pass) for record in planned.records))
-    errors, woven, judged = [], [], []
+    errors, judged = [], []
     for k, part in enumerate(welds(log)):
         of_seam, of_pass = plans.get(k, (k, 0))
         on, true = part & log.torch_on, true_seam(cell.station.truth, of_seam)
@@ -272,12 +270,11 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
             continue
         off = path_error(log.p_BTorch[on], curve, backwards=order.reverse)
         if weave.amplitude_m:
-            woven.append(measure_weave(log.time[on], off, weave.period_s, weave.plane_rad))
             off = _unwoven(log.time[on], off, weave)
         if true is not None:
             errors.append(off)
             judged.append((of_seam, of_pass))
-    outcome = WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, plan_error=plan_error, weave=tuple(woven))
+    outcome = WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, plan_error=plan_error)
     if not errors:
         return outcome
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
@@ -316,26 +313,6 @@ def pass_documents(weld: WeldOutcome, passes: Sequence[WeldPass], errors: list[d
         }
         found.append({"seam": seam + 1, "pass": number + 1, **ordered, **error})
     return found
-
-
-def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
-    """The ordered weave and the measured one of each seam; the mean path off the seam where a simulation knows that."""
-    dwell_s, known = order.dwell_left_s + order.dwell_right_s, weld.error is not None
-    mean = order.amplitude_m * (order.dwell_left_s - order.dwell_right_s) / order.period_s
-    middle = mean * np.array([np.cos(order.plane_rad), np.sin(order.plane_rad)])
-    measured = [
-        None
-        if m is None
-        else {
-            "amplitude_mm": 1e3 * m.amplitude_m,
-            "frequency_hz": 1.0 / (m.period_s - dwell_s),
-            "bow_mm": 1e3 * m.bow_m,
-            "mean_path_mm": 1e3 * float(np.hypot(*(np.array([m.left_m, m.up_m]) - middle))) if known else None,
-            "swings": m.swings,
-        }
-        for m in weld.weave
-    ]
-    return {"ordered": ordered_weave(order), "measured": measured}
 
 
 def ordered_weave(order: WeaveConfig) -> dict[str, Any]:

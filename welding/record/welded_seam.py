@@ -260,7 +260,8 @@ def _extent(values: Array) -> Spread:
 
 def _weave(record: WeldRecord, numbers: Numbers, burn: NDArray[np.intp]) -> dict[str, float] | None:
     order = ordered(record, numbers).get("weave")
-    columns = (record["s_seam_m"][burn], record["left_m"][burn], record["up_m"][burn])
+    s = record["s_seam_m"][burn]
+    columns = (s * np.sign(s[-1] - s[0]), record["left_m"][burn], record["up_m"][burn])
     if not order or not np.isfinite(columns).all():
         return None
     time = record["time_s"][burn]
@@ -270,6 +271,7 @@ def _weave(record: WeldRecord, numbers: Numbers, burn: NDArray[np.intp]) -> dict
     return {
         "amplitude_mm": 1e3 * found.amplitude_m,
         "frequency_hz": 1.0 / (found.period_s - sum(order["dwell_s"])),
+        "bow_mm": 1e3 * found.bow_m,
         "swings": found.swings,
     }
 
