@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort
 
@@ -242,9 +242,10 @@ class SeamRecord(Message):
     begins_m: float = 0.0  # of the whole seam, at the line's start
     reverse: bool = False  # the line runs from the seam's end to its start
 
-    def place(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def place(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return where on the whole seam the arc lengths s (...) m of the line are, m."""
-        return self.begins_m + (self.line.length - s if self.reverse and self.line is not None else s)
+        along = np.asarray(s, dtype=float)
+        return self.begins_m + (self.line.length - along if self.reverse and self.line is not None else along)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

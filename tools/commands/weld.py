@@ -180,7 +180,7 @@ def weld(
     """Weld a seam in a scenario, with the scanner's pose taken from the scenario.
 
     With --resume a broken weld goes on from its crater, and its folder then holds the result of all runs: the part is
-    scanned again, and the arc starts after you have typed yes.
+    scanned again, and the arc starts after your answer yes, y or g (Go on in the dashboard); no or End refuses.
     """
     if resume is not None:
         if name is not None or scenario != PRESET:

@@ -133,8 +133,11 @@ def arc_pieces(record: WeldRecord, plans: Sequence[Numbers]) -> list[ArcPiece]:
     place = place_mm(record)
     arcs, found = record.settings.get("arcs", ()), []
     for (seam, weld_pass), rows in seam_rows(record, plans):
-        for burn in burns(record, np.flatnonzero(rows & record.arc)):
+        of_pass = burns(record, np.flatnonzero(rows & record.arc))
+        for burn, later in zip(of_pass, [*of_pass[1:], None], strict=True):
             s, arc = place[burn], arcs[number[burn[0]]] if number[burn[0]] < len(arcs) else {"run": 1}
+            if later is not None and number[later[0]] == number[burn[0]]:
+                arc = arc | {"ended": "the power source reported no arc"}
             ends = (float(s.min()), float(s.max()))
             back = bool(s[-1] < s[0])
             piece = ArcPiece(seam=seam + 1, weld_pass=weld_pass + 1, from_mm=ends[back], to_mm=ends[not back], **arc)
@@ -173,8 +176,7 @@ def with_overlaps(pieces: Sequence[ArcPiece]) -> list[ArcPiece]:
 
 def burns(record: WeldRecord, on: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Rows (n,) of the arc, split where it was out."""
-    apart = (np.diff(on) > 1) | (np.diff(record["time_s"][on]) > GAP_S)
-    return np.split(on, np.flatnonzero(apart) + 1) if len(on) else []
+    return np.split(on, np.flatnonzero(np.diff(record["time_s"][on]) > GAP_S) + 1) if len(on) else []
 
 
 def seam_rows(record: WeldRecord, plans: Sequence[Numbers]) -> Iterator[tuple[Numbers, NDArray[np.bool_]]]:

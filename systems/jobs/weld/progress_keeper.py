@@ -169,14 +169,14 @@ class ProgressKeeper:
         Raises:
             OSError: the disk took no progress.
         """
+        if run is not None:
+            self._progress = replace(self._progress, ends=(*self._progress.ends[:-1], run.reason or "done"))
         if not self._threads:
             return
         if run is not None and run.interrupted is not None and self._lit:
             self._at = -math.inf
             self.look(run)
         if run is not None:
-            ends = (*self._progress.ends[:-1], run.reason or "done")
-            self._progress = replace(self._progress, ends=ends)
             self._put(self._state)
         with self._changed:
             self._closing = True

@@ -117,6 +117,19 @@ def test_what_is_welded_twice_counts_once() -> None:
     ]
 
 
+def test_an_arc_that_goes_out_by_itself_ends_a_piece() -> None:
+    arc = [0.0] * 5 + [1.0] * 45 + [0.0] * 50 + [1.0] * 51  # lit after 40 ms, out for 0.4 s
+    record = log([0.010] * 151, arc=arc, s_seam_m=(1e-3 * np.arange(151.0)).tolist())
+    record.settings["arcs"] = [{"run": 1, "ended": "held"}]
+    pieces = arc_pieces(record, [(0, 0)])
+    assert [(p.from_mm, p.to_mm, p.ended) for p in pieces] == [
+        (5.0, 49.0, "the power source reported no arc"), (100.0, 150.0, "held")
+    ]  # fmt: skip
+    record.columns["arc"][60:110] = 1.0
+    record.columns["arc"][70:75] = 0.0  # 40 ms: a contact bounces
+    assert len(arc_pieces(record, [(0, 0)])) == 1
+
+
 def test_a_hold_of_the_touch_begins_no_other_weld() -> None:
     phase = np.array(["TOUCH", "HELD", "TOUCH", "TRACK", "HELD", "BACK", "TRACK", "TOUCH", "TRACK"])
     held = np.isin(phase, ("HELD", "BACK"))
