@@ -15,6 +15,8 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.places import ROOT
+from tests.restarted import disagreements
+from tests.welding.record.test_welded_seam import log
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_apart
 from weldcal.systems.jobs.weld.progress_keeper import RESTART, sha256_of
@@ -23,7 +25,10 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.result_folder import RUNNING
 from weldcal.tools.commands.weld import killed_weld
+from weldcal.tools.report.weld_record import part_record
+from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.progress import Progress, Stretch
+from weldcal.welding.record.weld_log import weld_log_texts
 
 
 @pytest.fixture
@@ -119,6 +124,31 @@ def test_a_folder_says_how_far_a_killed_weld_came(broken: Path) -> None:
     (broken / RUNNING).write_text(f"{os.getppid()}\n")
     with pytest.raises(InputError, match="still runs"):
         killed_weld(broken)
+
+
+def test_a_joined_record_is_the_same_in_all_its_files(broken: Path) -> None:
+    """A run that was stopped at 41 mm, one that was killed at 60 mm, and the one that went on at 52 mm."""
+    runs = [log([0.010] * n, s_seam_m=(1e-3 * (a + np.arange(float(n)))).tolist()) for a, n in ((0.0, 42), (52.0, 90))]
+    for number, ended, run in ((1, "The operator stopped the run with Ctrl-C.", runs[0]), (3, "done", runs[1])):
+        run.settings["plans"], run.settings["arcs"] = [(0, 0)], [{"run": number, "ended": ended}]
+        run.settings["ended"] = ended
+    for path, text in zip((broken / "weld-1.csv", broken / "weld-1.json"), weld_log_texts(runs[0]), strict=True):
+        path.write_text(text)
+    second = Stretch(seam=0, piece=0, run=1, from_m=0.033, to_m=0.060, done=False, time="2026-11-27T10:00:00+00:00")
+    progress = state(broken, ends=("stopped", "killed", "done"), stretches=(second,))
+    record = part_record(WeldOrder(part="4711", operator="jd"), runs[1], progress, broken)
+    record.write(broken)
+    assert disagreements(broken, None) == []
+    document = json.loads((broken / "record.json").read_text())
+    assert [(p["run"], p["from_mm"], p["to_mm"], round(p["overlap_mm"], 6)) for p in document["pieces"]] == [
+        (1, 0.0, 41.0, 0.0), (2, 33.0, 60.0, 8.0), (3, 52.0, 141.0, 8.0)
+    ]  # fmt: skip
+    assert document["welded_mm"] == pytest.approx(141.0)
+    assert document["outside_limits"] == ["Seam 1: 33 to 60 mm were welded in run 2, whose log is lost."]
+    assert ["Ctrl-C" in document["broke_off"][0], "killed" in document["broke_off"][1]] == [True, True]
+    page = (broken / "record.html").read_text()
+    (broken / "record.html").write_text(page.replace("60.0", "61.0"))
+    assert disagreements(broken, None) == [f"record.html has no row {['33.0', '60.0']}"], "it finds another figure"
 
 
 def test_before_its_first_arc_a_killed_weld_has_no_record(broken: Path) -> None:

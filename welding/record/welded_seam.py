@@ -164,13 +164,14 @@ def evenness(record: WeldRecord) -> float:
 
 
 def with_overlaps(pieces: Sequence[ArcPiece]) -> list[ArcPiece]:
-    """The pieces with the length of each that was welded before."""
+    """The pieces, to the micrometre, with the length of each that was welded before."""
     found: list[ArcPiece] = []
     for piece in pieces:
         before = [(p.from_mm, p.to_mm) for p in found if p.name == piece.name]
         here = (piece.from_mm, piece.to_mm)
         twice = length_mm(before) + length_mm([here]) - length_mm([*before, here])
-        found.append(replace(piece, overlap_mm=max(twice, 0.0)))
+        a, b, overlap = (round(mm, 3) for mm in (*here, max(twice, 0.0)))
+        found.append(replace(piece, from_mm=a, to_mm=b, overlap_mm=overlap))
     return found
 
 
