@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort
 
@@ -230,7 +230,7 @@ class ScanView(Message):
     X_BC: RigidTransform | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SeamRecord(Message):
     """One plan: its seam's number, how its parts lie to each other, and the stretches (from, to) m left unwelded."""
 
@@ -239,6 +239,13 @@ class SeamRecord(Message):
     left_out: tuple[tuple[float, float], ...] = ()
     weld_pass: int = 0  # 0: the root
     line: SeamCurve | None = None  # of the tip
+    begins_m: float = 0.0  # of the whole seam, at the line's start
+    reverse: bool = False  # the line runs from the seam's end to its start
+
+    def place(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Return where on the whole seam the arc lengths s (...) m of the line are, m."""
+        along = np.asarray(s, dtype=float)
+        return self.begins_m + (self.line.length - along if self.reverse and self.line is not None else along)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from typing import TextIO
 
 HOLD, GO_ON = "h", "g"
+YES, NO = ("yes", "y", GO_ON), ("no", "n")
 KEYS = f"Type {HOLD} and Enter to hold the arm, {GO_ON} and Enter to go on, Ctrl-C to end."
-ANSWERS = f"Type {GO_ON} and Enter for yes, Ctrl-C to end."
+ANSWERS = "Type yes (or y, g) and Enter to start. Type no and Enter, or Ctrl-C, to refuse: no arc is lit."
 SLOWEST, FASTEST = 0.0, 3.0
 """Real-time rates of a simulation that may be asked for; 0 is as fast as it goes."""
 
@@ -75,12 +76,14 @@ class Operator:
             self._pace = float(pace)
 
     def says(self, line: str) -> None:
-        """Take a line of the terminal; lines other than HOLD and GO_ON are ignored."""
+        """Take a line of the terminal: HOLD, GO_ON, or the answer to a question; others are ignored."""
         word = line.strip().lower()
         if word == HOLD:
             self.hold()
-        elif word == GO_ON:
+        elif word == GO_ON or (self.question and word in YES):
             self.go_on()
+        elif self.question and word in NO:
+            self.end()
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Generic
 
@@ -16,7 +17,7 @@ from pydrake.systems.sensors import RgbdSensor
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.interrupts import SIGTERM, deferred
-from weldcal.systems.messages import Image, JobCommand, Scan
+from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.operator import ANSWERS, KEYS
 from weldcal.systems.pacing import (
     HostTiming,
@@ -35,6 +36,7 @@ COMMANDED_RAD_S = 1e-6  # above rounding of a zero command, and 1000 times below
 OPERATOR_CHECK_S = 0.02  # a choice: 50 looks a second at a button; an operator notices no delay below 0.1 s
 STOPPED_BY_OPERATOR = "The operator stopped the run with Ctrl-C"
 COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
+MOST_SHARE = 0.98  # of the job itself; the rest is for measuring and writing
 OVERTIME_S = 5.0  # added to the time limit at which the job holds itself
 
 
@@ -43,13 +45,23 @@ def no_progress(stage: str, fraction: float) -> None:
 
 
 @dataclass(kw_only=True)
+class ProcessTime:
+    """When the process was on: simulated s when it came on, wall clock (ISO 8601) of both ends, who held it then."""
+
+    on_s: float
+    start: str
+    end: str = ""
+    held_by: str = ""
+
+
+@dataclass(kw_only=True)
 class Run(Generic[JobOf]):
     """One run of a cell: final root context, scans by label, and (simulated, wall) seconds at each phase's start.
 
     `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
     None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before
-    the first motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
-    `seam_pictures`: by a seam's number, the finger camera's picture where its torch first came on and last went off.
+    the first motion. `share`: the completed share of the job, 0 to 1, which never falls. `arcs`: when the process was
+    on.
     """
 
     cell: Cell[JobOf]
@@ -62,7 +74,7 @@ class Run(Generic[JobOf]):
     held_by_person: int = 0
     host: HostTiming | None = None
     share: float = 0.0
-    seam_pictures: dict[int, list[Image]] = field(default_factory=dict)
+    arcs: list[ProcessTime] = field(default_factory=list)
 
     @property
     def root(self) -> Context:
@@ -172,7 +184,6 @@ def run_cell(
     finished_at, has_panel, operator = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.operator
     next_at, pictures = dict.fromkeys(LOOKS, 0.0), PictureWait()
     precedence: Callable[[bool], None] = _no_precedence
-    lit = False
 
     def due(what: str, now: float) -> bool:
         if now < next_at[what] - 1e-9:
@@ -181,7 +192,7 @@ def run_cell(
         return True
 
     def watch(root: Context) -> EventStatus:
-        nonlocal finished_at, lit
+        nonlocal finished_at
         if operator.holds and not operator.ends and not _process_on(cell, root) and cell.job.can_stand(root):
             if run.clock is None or run.clock.stands or not _commanded(cell, root):
                 _stand(run, progress)
@@ -201,9 +212,7 @@ def run_cell(
         look(run)
         if command.question and command.question not in (operator.question, operator.answered):
             operator.ask(command.question)
-        if _process_on(cell, root) != lit:
-            lit = not lit
-            _keep_picture(run, root, command.seam)
+        _note_arc(run, root.get_time(), _process_on(cell, root))
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
             run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
@@ -243,6 +252,7 @@ def run_cell(
         with deferred():  # the arm comes to rest first
             station.close()
     run.wall_seconds = time.perf_counter() - start
+    _note_arc(run, run.seconds, False)
     ended(run)
     if meshcat is not None:
         meshcat.StopRecording()
@@ -254,16 +264,18 @@ def _tell(run: Run[JobOf], root: Context, progress: Progress) -> None:
     """Report the stage and the completed share; a held job keeps the share that it had reached."""
     stage, share = run.cell.job.stage(root, run.phases)
     if not run.cell.job.command(root).held:
-        run.share = share
+        run.share = max(run.share, min(share, MOST_SHARE))
     progress(stage, run.share)
 
 
 def _stand(run: Run[JobOf], progress: Progress) -> None:
     """Keep the arm at rest and the Diagram's time where it is until the operator lets the job go on, or ends it."""
     operator = run.cell.operator
-    phase, share = run.cell.job.stage(run.root, run.phases)
-    held = f"{operator.question} {ANSWERS}" if operator.question else f"held by an operator ({phase}). {KEYS}"
-    progress(held, share)
+    phase, share = run.cell.job.stage(run.root, run.phases)[0], run.share
+    if operator.question:
+        progress(f"held by a question\n{operator.question}\n{ANSWERS}", share)
+    else:
+        progress(f"held by an operator ({phase})\n{KEYS}", share)
     run.held_by_person += 1
     operator.stands = True
     try:
@@ -326,13 +338,14 @@ def _keep_pace(run: Run[JobOf], root: Context) -> None:
         run.simulator.ResetStatistics()  # the new rate counts from here on
 
 
-def _keep_picture(run: Run[JobOf], root: Context, seam: int) -> None:
-    """Store the finger camera's newest picture as the seam's first, or in place of its last."""
-    station = run.cell.station.diagram
-    if station.HasOutputPort("finger_camera.image"):
-        image: Image = station.GetOutputPort("finger_camera.image").Eval(station.GetMyContextFromRoot(root))
-        kept = run.seam_pictures.setdefault(seam, [])
-        kept[1:] = [image]  # the first one is appended
+def _note_arc(run: Run[JobOf], time_s: float, on: bool) -> None:
+    """Note when the process comes on and goes off."""
+    lit, now = bool(run.arcs) and not run.arcs[-1].end, datetime.now(UTC).isoformat(timespec="milliseconds")
+    if on and not lit:
+        run.arcs.append(ProcessTime(on_s=time_s, start=now))
+    elif lit and not on:
+        operator = run.cell.operator
+        run.arcs[-1].end, run.arcs[-1].held_by = now, operator.held_by if operator.holds else ""
 
 
 def _keep_scan(run: Run[JobOf], root: Context) -> None:

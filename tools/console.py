@@ -250,7 +250,8 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 def progress_bar(title: str) -> Iterator[Progress]:
     """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter.
 
-    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is.
+    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is. What a stage
+    says after a line break is printed on lines of its own, above the bar.
     """
     reached = 0.0
 
@@ -265,6 +266,7 @@ def progress_bar(title: str) -> Iterator[Progress]:
         def report_line(stage: str, fraction: float) -> None:
             nonlocal last, told
             fraction = never_less(fraction)
+            stage = stage.replace("\n", ". ")
             kind = _NUMBER.sub("", stage.partition(", ")[0])  # a count within a stage is no new stage
             if kind != last or fraction >= told + SHARE_TOLD:
                 typer.echo(f"[{100 * fraction:3.0f} %] {title}: {stage}", err=True)
@@ -281,9 +283,14 @@ def progress_bar(title: str) -> Iterator[Progress]:
     words = TextColumn("{task.description}", table_column=Column(no_wrap=False))  # a long stage takes a second line
     columns = (words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=1.0)
+        task, said = bar.add_task(title, total=1.0), ""
 
         def report_bar(stage: str, fraction: float) -> None:
+            nonlocal said
+            stage, _, more = stage.partition("\n")
+            if more and more != said:  # the bar's line is cut where the terminal ends
+                bar.console.print(more, markup=False, highlight=False, style="bold")
+            said = more
             bar.update(task, completed=never_less(fraction), description=f"{title}: {stage}")
 
         yield report_bar

@@ -44,12 +44,21 @@ def test_a_root_and_a_cap_over_a_tack(tmp_path: Path) -> None:
     assert (cap["lateral_mm"], cap["vertical_mm"], cap["reverse"]) == (1.5, 4.0, True)
     for one in (root, cap):
         assert one["torch_max_mm"] < 0.3
-    # the cap's pieces are counted from its own start, which is the seam's end
-    for stretches in found["arc_mm"]:
-        assert np.array(stretches) == pytest.approx(np.array([[0.0, 30.0], [40.0, 70.0]]), abs=1.0)
+    # places are counted from the seam's start, and the cap is welded from its end
+    of_root, of_cap = found["arc_mm"]
+    assert np.array(of_root) == pytest.approx(np.array([[0.0, 30.0], [40.0, 70.0]]), abs=1.0)
+    assert np.array(of_cap) == pytest.approx(np.array([[70.0, 40.0], [30.0, 0.0]]), abs=1.0)
+    assert [piece["ended"] for piece in found["pieces"]] == ["done"] * 4
     assert found["welded_mm"] == pytest.approx(120.0, abs=3.0)
     assert result.record is not None
     assert [(seam.seam, seam.weld_pass) for seam in result.record.seams] == [(1, 1), (1, 2)]
+    ((tack,), none) = (seam.tacks for seam in result.record.seams)
+    assert (tack["from_mm"], tack["to_mm"], none) == (28.0, 36.0, ())
+    assert tack["path_mm"].most < 0.3
+    assert tack["travel_angle_deg"].most - tack["travel_angle_deg"].least > 1.0, "the lifted tip pitches the torch"
+    pages = [(tmp_path / "run" / name).read_text() for name in ("record.html", "report.html")]
+    assert all("tack at 28 to 36 mm: travel angle" in page for page in pages)
+    assert all(f"Paths over seam {name}</h2>" in pages[1] for name in ("1", "1, pass 2"))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import threading
 import time
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.operator import Operator, operator_at
 from weldcal.systems.phase_words import phase_words
-from weldcal.systems.runner import run_cell
+from weldcal.systems.runner import Run, _tell, run_cell
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.commands.run import JobRun
 
 TOLD = """
 scanner: !RenderedScanner {mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}
@@ -39,6 +41,32 @@ def test_the_terminals_lines_hold_and_let_go_on() -> None:
     for line, holds in (("x", False), ("h", True), ("\n", True), (" G ", False), ("go", False), ("H", True)):
         operator.says(line)
         assert operator.holds == holds
+
+
+def test_a_question_is_answered_by_yes_and_refused_by_no() -> None:
+    for line, answered, ends in (("yes\n", True, False), (" Y ", True, False), ("g", True, False), ("ja", False, False), ("No", False, True)):  # fmt: skip
+        operator = Operator()
+        operator.ask("Start?")
+        operator.says(line)
+        assert (operator.answered == "Start?", operator.ends) == (answered, ends)
+    operator = Operator()
+    operator.hold()
+    for line in ("yes", "no"):
+        operator.says(line)
+    assert (operator.holds, operator.ends) == (True, False), "nothing was asked"
+
+
+def test_the_completed_share_never_falls() -> None:
+    shares, told = iter((0.65, 0.31, 0.71, 1.0, 0.98)), []
+    job = SimpleNamespace(
+        stage=lambda root, phases: ("", next(shares)), command=lambda root: SimpleNamespace(held=False)
+    )
+    run = Run(cell=cast(Any, SimpleNamespace(job=job)), simulator=cast(Any, None))
+    for _ in range(5):
+        _tell(run, cast(Any, None), lambda stage, share: told.append(share))
+    assert told == [0.65, 0.65, 0.71, 0.98, 0.98]
+    finished = JobRun(cast(Any, SimpleNamespace(held=False, share=0.99)), None, "simulated")
+    assert finished.share(0.985) == 0.99
 
 
 def test_a_terminal_is_listened_to_until_it_ends() -> None:

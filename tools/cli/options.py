@@ -168,8 +168,8 @@ class Call:
         self.keep(self.written)
         return self.written
 
-    def keep(self, folder: Path) -> None:
-        """Keeps a folder for the result of this call.
+    def keep(self, folder: Path, goes_on: bool = False) -> None:
+        """Keeps a folder for the result of this call; `goes_on`: with the result that it holds.
 
         Raises:
             InputError: nothing can be written there, it holds an earlier result, or another command writes there.
@@ -177,7 +177,7 @@ class Call:
         if folder in self._kept:
             return
         check_writable(folder)
-        overwrite, resumes = bool(self.given.get("overwrite")), "workers" in self.given
+        overwrite, resumes = goes_on or bool(self.given.get("overwrite")), "workers" in self.given
         self._stack.enter_context(claimed(folder, overwrite=overwrite, resumes=resumes))
         self._stack.enter_context(whole_result(folder))
         self._kept.append(folder)

@@ -87,6 +87,12 @@ def _take(mark: Path, folder: Path) -> bool:
         return True
 
 
+def writer(folder: Path) -> int | None:
+    """Number of the process that writes into a folder now; None where none does."""
+    process = _process(folder / RUNNING) if (folder / RUNNING).exists() else None
+    return process if process is not None and _runs(process) else None
+
+
 def _process(mark: Path) -> int | None:
     until = time.monotonic() + _PATIENCE_S
     while time.monotonic() < until:

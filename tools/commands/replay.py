@@ -27,7 +27,9 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools import console
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command, switch
 from weldcal.tools.commands.run import RECORDING, one_thread
+from weldcal.tools.commands.weld import killed_weld
 from weldcal.tools.report.first_screen import pose_rows
+from weldcal.tools.report.weld_record import RECORD_HTML
 
 IDENTICAL, DIFFERS = "identical", "differs"
 
@@ -174,12 +176,20 @@ def view(
         bool, switch("--browser/--no-browser", "Open the pages, or only print their paths.", show_default="browser")
     ] = True,
 ) -> Outcome:
-    """Show a finished run again: its 3D recording and its report."""
-    pages = find_pages(result)
+    """Show a finished run again: its 3D recording and its report; of a weld that was killed, how to go on."""
+    note, record = killed_weld(result) if result.is_dir() else "", (result / RECORD_HTML).resolve()
+    if note and not record.exists():
+        raise InputError(note)
+    pages = [record] if note else find_pages(result)
+    if note:
+        console.emit_warning(note)
     opened = browser and open_pages(pages)
     if browser and not opened:
         console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
-    return Outcome({"state": "done", "pages": pages, "opened": opened}, text="\n".join(map(str, pages)))
+    return Outcome(
+        {"state": "done", "pages": pages, "opened": opened} | ({"note": note} if note else {}),
+        text="\n".join(map(str, pages)),
+    )
 
 
 def find_pages(result: Path) -> list[Path]:

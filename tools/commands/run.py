@@ -95,7 +95,7 @@ class JobRun:
 
     def share(self, done: float) -> float:
         """Return the completed share while results are written: ``done`` if completed, else what it had reached."""
-        return self.run.share if self.run.held else done
+        return self.run.share if self.run.held else max(self.run.share, done)
 
     @property
     def cell(self) -> Cell[Any]:

@@ -18,7 +18,7 @@ from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.models.errors import InputError
-from weldcal.models.files import whole_result
+from weldcal.models.files import whole_result, write_apart
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.progress_keeper import RESTART, ProgressKeeper, sha256_of
@@ -34,14 +34,16 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
+from weldcal.tools.cli.result_folder import writer
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
+from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
-from weldcal.tools.report.weld_record import part_record, weld_record
+from weldcal.tools.report.weld_record import part_record, run_log, weld_record
+from weldcal.welding.record.progress import KILLED, POWER, ProgressError, load_progress
 from weldcal.welding.record.progress import Progress as WeldProgress
-from weldcal.welding.record.progress import ProgressError, load_progress
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.seam.restart import Restart
 
@@ -68,9 +70,7 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     Raises:
         InputError: there is nothing to go on with, its files were changed, or nobody could answer the question.
     """
-    progress = load_progress(folder)
-    if progress.continued_in:
-        raise ProgressError(f"The weld in '{folder}' has gone on in '{progress.continued_in}': resume that one.")
+    progress = load_progress(folder).settled()
     files = {path.name: path.read_bytes() for path in (folder / RESTART).glob("*") if path.is_file()}
     if sha256_of(files) != progress.scenario_sha256:
         raise ProgressError(
@@ -78,12 +78,8 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
             " by hand."
         )
     scenario = load_scenario(str(folder / RESTART / SCENARIO))
-    if scenario.welding.passes:  # the path that a later pass follows was felt by several runs
-        raise ProgressError("A broken weld of several passes cannot go on: weld the rest by hand.")
-    if scenario.welding.stitch is not None and not scenario.welding.stitch.stitch().middle_out:
-        raise ProgressError(
-            "A broken weld of stitches can go on only with welding.stitch.order: middle_out: weld the rest by hand."
-        )
+    if why := by_hand(scenario):
+        raise ProgressError(why)
     if progress.done:
         raise ProgressError(f"The weld in '{folder}' is complete: nothing is left to weld.")
     if not (live.get("browser") or sys.stdin.isatty()):
@@ -98,6 +94,42 @@ def broken_weld(folder: Path, overlap_mm: float, live: Mapping[str, Any]) -> Bro
     if live.get("robot") is None:
         options["robot"] = progress.robot
     return BrokenWeld(progress, scenario, options)
+
+
+def by_hand(scenario: Scenario) -> str:
+    """Why a broken weld of this scenario cannot go on; empty where it can."""
+    if scenario.welding.passes:  # the path that a later pass follows was felt by several runs
+        return "A broken weld of several passes cannot go on: weld the rest by hand."
+    if scenario.welding.stitch is not None and not scenario.welding.stitch.stitch().middle_out:
+        return "A broken weld of stitches can go on only with welding.stitch.order: middle_out: weld the rest by hand."
+    return ""
+
+
+def killed_weld(folder: Path) -> str:
+    """Write the record of a weld whose last run was killed; how far it came and how to go on, "" for any other folder.
+
+    Raises:
+        InputError: the weld still runs.
+    """
+    try:
+        progress = load_progress(folder).settled()
+    except ProgressError:  # there is none, or one of another version
+        return ""
+    if (process := writer(folder)) is not None:
+        raise InputError(f"The weld in '{folder}' still runs (process {process}): wait until it has ended.")
+    if progress.done or progress.ends[-1] not in (KILLED, POWER):
+        return ""
+    scenario, here = load_scenario(str(folder / RESTART / SCENARIO)), "Before its first arc"
+    if progress.stretches:
+        progress.write(folder)
+        part_record(scenario.welding.order, None, progress, folder).write(folder)
+    if progress.stretches and progress.stretches[-1].run == len(progress.ends) - 1:
+        last = progress.stretches[-1]
+        here = f"At {1e3 * last.to_m:.0f} mm of seam {last.seam + 1}" + f", pass {last.weld_pass + 1}," * bool(
+            last.weld_pass
+        )
+    way_on = by_hand(scenario) or f"Go on with {typed('weld --resume', folder)}"
+    return f"{here} this run was {progress.ends[-1]}. {way_on}"
 
 
 def restarting(restart: Restart) -> dict[str, Replacement]:
@@ -119,15 +151,14 @@ def keeper_of(scenario: Scenario, options: RunOptions, earlier: WeldProgress | N
 
     None where no file can name the scenario's drivers: such a weld is not resumed.
     """
-    folder = str(options.out.absolute())
     try:
         files = packed(scenario)
     except RuntimeError:  # yaml_dump_typed: a driver that was made in Python
         return None
     begun = earlier or WeldProgress(
-        scenario=options.scenario, seed=options.seed, robot=options.robot, scenario_sha256="", folders=()
+        scenario=options.scenario, seed=options.seed, robot=options.robot, scenario_sha256="", ends=()
     )
-    begun = dc.replace(begun, scenario_sha256=sha256_of(files), folders=(*begun.folders, folder), robot=options.robot)
+    begun = dc.replace(begun, scenario_sha256=sha256_of(files), ends=(*begun.ends, ""), robot=options.robot)
     return ProgressKeeper(options.out, files, begun)
 
 
@@ -147,13 +178,17 @@ def weld(
 ) -> Outcome:
     """Weld a seam in a scenario, with the scanner's pose taken from the scenario.
 
-    With --resume a broken weld goes on from its crater: the part is scanned again, and the arc starts after your yes.
+    With --resume a broken weld goes on from its crater, and its folder then holds the result of all runs: the part is
+    scanned again, and the arc starts after your answer yes, y or g (Go on in the dashboard); no or End refuses.
     """
     if resume is not None:
         if name is not None or scenario != PRESET:
             raise typer.BadParameter("--resume takes the scenario from its folder: give no other")
+        if call.out is not None:
+            raise typer.BadParameter("--resume writes into its folder: omit --out")
         broken = broken_weld(resume, overlap_mm, call.live)
-        call.seed = broken.progress.seed
+        call.seed, call.out = broken.progress.seed, resume
+        call.keep(resume, goes_on=True)
         options = run_options(call, "weld", broken.progress.scenario, **broken.options)
         found = run_scenario(broken.scenario, options, call.progress, broken.progress)
         return Outcome(found.summary(), first=found.first)
@@ -230,8 +265,11 @@ def measure(
         else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
     )
     weld = weld_outcome(cell, run.root)
-    log = None if weld is None else weld_record(run, weld, options.seed, options.scenario, robot)
-    record = None if log is None else part_record(run, log, progress)
+    number = 1 if progress is None else len(progress.ends)
+    log = None if weld is None else weld_record(run, weld, options.seed, options.scenario, robot, number)
+    order, record = run.cell.scenario.welding.order, None
+    if log is not None or (progress is not None and progress.stretches):
+        record = part_record(order, log, progress, options.out)
     return DemoResult(
         options=options,
         run=run,
@@ -241,6 +279,7 @@ def measure(
         robot=robot,
         record=record,
         broken=progress is not None and bool(progress.stretches) and not progress.done,
+        by_hand=by_hand(run.cell.scenario),
     )
 
 
@@ -252,6 +291,12 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
         write_calibration(run.cell, result.status, result.options.seed, folder)
         write_scans(run, result.status, folder / SCANS, result.robot)
         if result.record is not None:
+            if result.record.own is not None and (result.broken or result.record.run > 1):
+                table = run_log(folder, result.record.run)
+                for path, text in zip(
+                    (table, table.with_suffix(".json")), weld_log_texts(result.record.own), strict=True
+                ):
+                    write_apart(path, text)
             write_weld_log(result.record.log, folder)
             result.record.write(folder)
         if records := run.cell.job.planned_seam(run.root).records:

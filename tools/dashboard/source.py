@@ -136,6 +136,7 @@ class DashboardSource:
         self.replays = False
         self.result: dict[str, Any] | None = None
         self.files: dict[str, Path] = {}
+        self._worked_s, self._looked = 0.0, time.monotonic()
         self._paces: deque[tuple[float, float]] = deque(maxlen=50)
 
     def stage(self, text: str, share: float) -> None:
@@ -211,6 +212,7 @@ class DashboardSource:
             },
             "steps": steps(facts, "done" if state == DONE else stage_of(moment)),
             "share": round(self._share, 3) if running else 1.0,
+            "wall_s": round(self._work(moment), 1),
             "left_s": self._left_s(moment) if running else None,
             "time_s": round(moment.time, 1),
             "pace": {"asked": operator.pace or 0.0, "now": self._pace(moment.time)},
@@ -227,9 +229,18 @@ class DashboardSource:
         }
 
     def _left_s(self, moment: Moment) -> float | None:
-        """Seconds of the wall clock that are left, about, at the pace that was asked for."""
+        """Seconds of the wall clock that are left, about, at the pace so far or at the slower one asked for."""
         left = left_s(self.facts, moment, self._share)
-        return left if left is None or not self.operator.pace else round(left / self.operator.pace)
+        slower = 1.0 / self.operator.pace if self.operator.pace else 0.0
+        so_far = self._worked_s / moment.time if self._worked_s > PACE_OVER_S else min(1.0, slower or 1.0)
+        return None if left is None else round(left * max(so_far, slower))
+
+    def _work(self, moment: Moment) -> float:
+        """Seconds of the wall clock since the run began, without those in which an operator held it."""
+        before, self._looked = self._looked, time.monotonic()
+        if moment.time > 0.0 and not self.operator.stands:
+            self._worked_s += self._looked - before
+        return self._worked_s
 
     def _state(self) -> tuple[str, str]:
         """Return the state in large letters, and the line under it: by whom and why, or what the arm does."""
@@ -241,7 +252,7 @@ class DashboardSource:
         if operator.ends:
             return STOPPING, f"ended by {operator.ended_by}; the process goes off and the arm comes to rest"
         if operator.stands and operator.question:
-            return HELD, f"{operator.question} Go on is yes, End is no."
+            return HELD, f"{operator.question} Go on is yes, End is no: no arc is lit."
         if operator.stands:
             return HELD, f"by {operator.held_by}, during: {doing}. {self._go_on_line()}"
         if operator.holds:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
-from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import Part
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
@@ -36,7 +35,6 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
-from weldcal.tools.report.plots_weld import NEXT_SEAM_S, WeldTrace, broken
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import (
@@ -44,15 +42,12 @@ from weldcal.tools.report.weld import (
     WeldOutcome,
     felt_seams,
     fit_up_document,
+    ordered_weave,
     pass_documents,
-    weave_document,
 )
 from weldcal.tools.report.weld_record import PartRecord
-from weldcal.welding.record.process import PathError, path_error, speed_along
+from weldcal.welding.record.process import PathError
 from weldcal.welding.record.weld_log import heat_summary
-from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.settings import ServoConfig
-from weldcal.welding.servo.state import Phase
 
 ARM_NOTE_M = 1e-4  # the torch's mean error that welds are to keep
 
@@ -68,6 +63,7 @@ class DemoResult:
     weld: WeldOutcome | None
     record: PartRecord | None = None
     broken: bool = False  # a seam, or the seams after it, are not welded yet
+    by_hand: str = ""  # why a broken weld could not go on
     robot: str = "simulated"
 
     @property
@@ -99,7 +95,7 @@ class DemoResult:
         """What the job warned of and did not hold for, and what is outside the order's limits."""
         sequencer = self.run.cell.job.sequencer
         warned = sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
-        return warned if self.record is None else (*warned, *self.record.outside)
+        return warned if self.record is None else (*self.record.broke_off, *warned, *self.record.outside)
 
     @property
     def first(self) -> FirstScreen:
@@ -172,9 +168,11 @@ class DemoResult:
         )
 
     def _lead(self) -> str:
-        if self.weld is None or self.weld.speed is None or self.state != "done":
+        if self.record is None or not self.record.seams or self.state != "done":
             return ""
-        return f"{1e3 * self.weld.speed.welded_m:.0f} mm of seam are welded."
+        off = len(self.record.broke_off)
+        over = f", in spite of {off} interruption{'' if off == 1 else 's'}" if off else ""
+        return f"{self.record.welded_mm:.0f} mm of seam are welded{over}."
 
     def _welded(self) -> dict[str, str]:
         """The torch's error where a simulation knows it, as a row."""
@@ -199,6 +197,8 @@ class DemoResult:
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
         if self.state == "held":
+            if self.broken and self.by_hand:
+                return Next(self.by_hand, typed("view", folder))
             if self.broken:
                 return Next(
                     "Remove the cause that is named above, and move the arm home. Then go on from the crater.",
@@ -258,16 +258,11 @@ class DemoResult:
                 found["seams"] = seams
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
-        if self.weld is not None and self.weld.speed is not None:
-            found["torch_speed_cv"] = self.weld.speed.cv
-            found["welded_mm"] = 1e3 * self.weld.speed.welded_m
-            heat = None if self.record is None else heat_summary(self.record.log)
-            found["heat_input_kJ_mm"] = None if heat is None else heat[0]
         if self.record is not None:
-            found |= self.record.summary()
-            found["arc_mm"] = [seam.arc_mm for seam in self.record.seams]
-        if self.weld is not None and self.weld.weave:
-            found["weave"] = weave_document(self.weld, self.run.cell.job.servo_config.weave)
+            heat = heat_summary(self.record.log)
+            found |= self.record.summary() | {"heat_input_kJ_mm": None if heat is None else heat[0]}
+        if self.record is not None and (order := self.run.cell.job.servo_config.weave).amplitude_m:
+            found["weave"] = {"ordered": ordered_weave(order), "measured": self._weaves()}
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
@@ -291,6 +286,17 @@ class DemoResult:
                 [1e3 * a, 1e3 * b] for r in {r.seam: r for r in records}.values() for a, b in r.left_out
             ]
         found |= self.run.timing()
+        return found
+
+    def _weaves(self) -> list[dict[str, float | None]]:
+        """The measured weave of each seam and pass; where a simulation knows it, how far its mean path is off."""
+        errors = {} if self.weld is None else dict(zip(self.weld.plans, self.weld.seams, strict=True))
+        found: list[dict[str, float | None]] = []
+        for seam in () if self.record is None else self.record.seams:
+            off = errors.get((seam.seam - 1, seam.weld_pass - 1))
+            mean_mm = None if off is None else 1e3 * math.hypot(off.lateral.mean(), off.height.mean())
+            if seam.weave is not None:
+                found.append({"seam": seam.seam, "pass": seam.weld_pass, **seam.weave, "mean_path_mm": mean_mm})
         return found
 
     def calibration_summary(self) -> dict[str, object]:
@@ -339,10 +345,9 @@ def demo_pictures(result: DemoResult) -> dict[str, bytes]:
         plan, part = cell.job.planned_seam(result.run.root), cell.station.cad
         if isinstance(part, Part) and plan.X_BP is not None and plan.points_B is not None:
             pictures["part"] = plots_weld.part_in_scan(plan.points_B, part.mesh, plan.X_BP)
-        trace = weld_trace(weld, cell.job.servo_config)
-        if len(trace.s) > 1:
-            pictures["seam"] = plots_weld.paths(trace)
-            pictures["along"] = plots_weld.along_the_weld(trace)
+        for name, trace in plots_weld.weld_traces(weld, cell, result.run.root).items():
+            pictures[f"seam_{name}"] = plots_weld.paths(trace)
+            pictures[f"along_{name}"] = plots_weld.along_the_weld(trace)
     return pictures
 
 
@@ -362,8 +367,8 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         scenario_name=Path(result.options.scenario).stem,
         status=status,
         weld=weld,
-        tip_error_mm=None if weld is None else 1e3 * tip_error(weld),
         pictures=pictures,
+        welded=[name.removeprefix("seam_") for name in pictures if name.startswith("seam_")],
         planned=_planned(result),
         record=result.record,
         pose=pose,
@@ -450,54 +455,3 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     plain(axes, "scans used", "error, mm")
     picture.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     return svg(picture)
-
-
-def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
-    """Return the weld for the pictures, over the planned seam; y of the base is drawn to the right, as in the cell."""
-    log, named = weld.log, weld.log.telemetry
-    keep = named["phase"] != list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
-    speed = speed_along(log.time, log.p_BTorch)
-    errors = [
-        None if e is None else (broken(e.s, np.flatnonzero(np.diff(e.s) < 0.0) + 1), e.lateral, e.height)
-        for e in (weld.plan_error, weld.error)
-    ]
-    legs = np.flatnonzero(np.diff(log.time[keep]) > NEXT_SEAM_S) + 1
-    return WeldTrace(
-        s=broken(named["s_torch"][keep], legs),
-        torch_on=log.torch_on[keep],
-        felt=named["phase"][keep] == list(Phase).index(Phase.TRACK),
-        tip=broken(log.p_BTip[keep], legs),
-        torch=broken(log.p_BTorch[keep], legs),
-        robot=broken(log.p_BRobot[keep], legs),
-        planned=_line(weld.planned),
-        true=_line(weld.true_seam),
-        plan_error=errors[0],
-        torch_error=errors[1],
-        delta_n=named["delta_n"][keep],
-        delta_axial=named["delta_axial"][keep],
-        speed=speed[keep],
-        omega=named["omega"][keep],
-        n_d_dot_n_t=named["n_d_dot_n_t"][keep],
-        weld_speed=config.weld_speed_m_s,
-        delta_d=config.deflection.delta_d_m,
-        axial_d=config.deflection.axial_d_m,
-        omega_max=config.limits.omega_max_rad_s,
-        e_t=named["e_t"][keep],
-        work=log.work[keep],
-        travel=log.travel[keep],
-        windows=(config.windows.work_rad, config.windows.travel_rad),
-        axes=(1, 0),
-        names=("y, mm", "x, mm"),
-    )
-
-
-def _line(seam: SeamCurve | None) -> Array | None:
-    return None if seam is None else np.asarray(seam.position(np.linspace(0.0, seam.length, 400)))
-
-
-def tip_error(weld: WeldOutcome) -> float:
-    """Mean distance (m) sideways between the felt tip line and the true seam while the servo tracked."""
-    felt = weld.log.telemetry["phase"] == list(Phase).index(Phase.TRACK)
-    if weld.true_seam is None or not felt.any():
-        return float("nan")
-    return path_error(weld.log.p_BTip[felt], weld.true_seam).mean_m

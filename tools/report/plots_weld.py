@@ -1,7 +1,7 @@
 """Plots of a weld: the paths over the seam (the paper's Fig. 13) and the quantities along it."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,15 +9,30 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
 from scipy.spatial import cKDTree
 
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
-from weldcal.tools.report.pictures import GREY, OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.messages import SeamRecord
+from weldcal.tools.report.pictures import GREY, OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, subplots, svg
+from weldcal.tools.report.weld import WeldOutcome, true_seam, welds
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.planes import into
+from weldcal.welding.record.order import OrderLimits
+from weldcal.welding.record.process import PathError, speed_along
+from weldcal.welding.record.weld_log import WeldRecord
+from weldcal.welding.record.welded_seam import burns, place_mm, travel_speed
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 _SMALL = 8
+_INCH = 1.35  # height of one curve
+_SMOOTH_S = 0.2  # a choice: a reader's eye takes the mean of a pulsed or noisy arc
+APART_M = 2e-3  # a choice: places of one arc are far nearer to each other
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
 _AGREES_M, _BESIDE_M, _MOST_DOTS = 0.001, 0.015, 6000  # registration.TOLERANCE_M; what is drawn beside the part
 _DOTTED = (0, (1.2, 0.7))
@@ -146,8 +161,11 @@ def _lines(axes: Axes, trace: WeldTrace) -> None:
     felt, on = trace.felt, trace.torch_on
     drawn: Iterable[tuple[Array | None, dict[str, object]]] = (
         (trace.planned, {"color": PLANNED, "lw": 3.5, "ls": _DOTTED, "label": "planned seam"}),
-        (trace.tip[felt], {"color": OURS, "lw": 4.5, "alpha": 0.45, "label": "tip, as felt"}),
-        (trace.torch[on], {"color": TORCH, "lw": 2.0, "label": "torch, arc on"}),
+        (
+            np.where(felt[:, None], trace.tip, np.nan),
+            {"color": OURS, "lw": 4.5, "alpha": 0.45, "label": "tip, as felt"},
+        ),
+        (np.where(on[:, None], trace.torch, np.nan), {"color": TORCH, "lw": 2.0, "label": "torch, arc on"}),
         (trace.robot, {"color": ROBOT, "lw": 1.2, "ls": "-.", "label": "robot (the tip's rest point)"}),
         (trace.true, {"color": "black", "lw": 0.9, "ls": (0, (4, 3)), "label": "true seam (simulation only)"}),
     )
@@ -234,7 +252,7 @@ def _speed(axes: Axes, trace: WeldTrace) -> None:
     axes.set_ylim(min(0.65 * wanted, low - 0.05 * wanted), max(1.35 * wanted, high + 0.05 * wanted))
     _note(axes, "±25 %", 1.25 * wanted, "top")
     _note(axes, "±1 %", 1.01 * wanted, "bottom")
-    plain(axes, "", "torch speed,\nmm/s")
+    plain(axes, "", "travel speed,\nmm/s")
 
 
 def _turning(axes: Axes, trace: WeldTrace) -> None:
@@ -316,3 +334,130 @@ def _not_steering(axes: Axes, trace: WeldTrace) -> None:
     on = np.flatnonzero(trace.torch_on)
     for k in on[[0, -1]] if len(on) else ():
         axes.axvline(1e3 * s[k], color="black", lw=0.7, ls=":")
+
+
+def weld_traces(weld: WeldOutcome, cell: Cell[WeldJob], root: Context) -> dict[str, WeldTrace]:
+    """The weld for the pictures by the names of its seams and passes, such as 1 and 1_pass_2."""
+    plans = cell.job.planned_seam(root).records or (SeamRecord(seam=0, line=weld.planned),)
+    parts, passes = welds(weld.log)[: len(plans)], cell.scenario.welding.later_passes()
+    lit = [k for k, part in enumerate(parts) if (part & weld.log.torch_on).any()]
+    errors = dict(zip(lit, weld.seams, strict=True)) if len(lit) == len(weld.seams) else {}
+    of_seam: dict[tuple[int, int], list[int]] = {}
+    for k, plan in enumerate(plans[: len(parts)]):
+        of_seam.setdefault((plan.seam, plan.weld_pass), []).append(k)
+    found = {}
+    for (seam, number), of_it in of_seam.items():
+        true = true_seam(cell.station.truth, seam)
+        if true is not None and number:
+            true = true.raised(passes[number - 1].vertical_m, passes[number - 1].lateral_m)
+        s = np.full(len(weld.log.time), np.nan)
+        for k in of_it:
+            s[parts[k]] = plans[k].place(weld.log.telemetry["s_torch"][parts[k]])
+        of_plan = weld.plan_error if of_it[-1] == len(parts) - 1 and not number else None
+        off = ([of_plan] if of_plan else [], [errors[k] for k in of_it if k in errors])
+        trace = weld_trace(weld, cell.job.servo_config, s, off)
+        if len(trace.s) > 1:
+            name = f"{seam + 1}" + f"_pass_{number + 1}" * bool(number)
+            found[name] = replace(trace, planned=_line(plans[of_it[-1]].line), true=_line(true))
+    return found
+
+
+def weld_trace(weld: WeldOutcome, config: ServoConfig, place: Array, off: Sequence[Sequence[PathError]]) -> WeldTrace:
+    """Return the weld for the pictures where it has a place (N,) m along the seam; `off`: errors of plan and torch.
+
+    y of the base is drawn to the right, as in the cell.
+    """
+    log, named = weld.log, weld.log.telemetry
+    keep = np.isfinite(place) & (named["phase"] != list(Phase).index(Phase.TOUCH))  # the search has no place
+    along = np.outer(np.nan_to_num(named["s_torch"]), [1.0, 0.0, 0.0])  # without the swings of a weave
+    speed = speed_along(log.time, along if config.weave.amplitude_m else log.p_BTorch)
+    errors: list[tuple[Array, Array, Array] | None] = []
+    for parts in off:
+        s, left, up = (np.concatenate([[], *(getattr(e, n) for e in parts)]) for n in ("s", "lateral", "height"))
+        errors.append((broken(s, np.flatnonzero(np.abs(np.diff(s)) > APART_M) + 1), left, up) if parts else None)
+    legs = np.flatnonzero(np.diff(log.time[keep]) > NEXT_SEAM_S) + 1
+    return WeldTrace(
+        s=broken(place[keep], legs),
+        torch_on=log.torch_on[keep],
+        felt=named["phase"][keep] == list(Phase).index(Phase.TRACK),
+        tip=broken(log.p_BTip[keep], legs),
+        torch=broken(log.p_BTorch[keep], legs),
+        robot=broken(log.p_BRobot[keep], legs),
+        planned=None,
+        true=None,
+        plan_error=errors[0],
+        torch_error=errors[1],
+        delta_n=named["delta_n"][keep],
+        delta_axial=named["delta_axial"][keep],
+        speed=speed[keep],
+        omega=named["omega"][keep],
+        n_d_dot_n_t=named["n_d_dot_n_t"][keep],
+        weld_speed=config.weld_speed_m_s,
+        delta_d=config.deflection.delta_d_m,
+        axial_d=config.deflection.axial_d_m,
+        omega_max=config.limits.omega_max_rad_s,
+        e_t=named["e_t"][keep],
+        work=log.work[keep],
+        travel=log.travel[keep],
+        windows=(config.windows.work_rad, config.windows.travel_rad),
+        axes=(1, 0),
+        names=("y, mm", "x, mm"),
+    )
+
+
+def _line(seam: SeamCurve | None) -> Array | None:
+    return None if seam is None else np.asarray(seam.position(np.linspace(0.0, seam.length, 400)))
+
+
+def arc_along_seam(record: WeldRecord, rows: NDArray[np.bool_], limits: OrderLimits) -> bytes | None:
+    """Draw current, voltage, wire feed, travel speed and gap of these rows (N,) along the seam; None without an arc.
+
+    Measured values are lines, one for each piece; set values dashed, limits grey bands.
+    """
+    pieces = [piece for piece in burns(record, np.flatnonzero(rows & record.arc)) if len(piece) > 1]
+    if not pieces:
+        return None
+    s = place_mm(record)
+    s = s if np.isfinite(s[pieces[0]]).all() else record["time_s"]  # of a log of before
+    wire = 1e3 * record["torch_speed_m_s"] if record.settings.get("woven") else None
+    curves = [
+        ("current, A", record["current_A"], record["set_current_A"], limits.current_A),
+        ("voltage, V", record["voltage_V"], record["set_voltage_V"], limits.voltage_V),
+        ("wire feed,\nm/min", None, record["set_wire_feed_m_min"], None),
+        ("travel speed,\nmm/s", 1e3 * travel_speed(record), None, limits.speed_mm_s),
+        ("woven wire,\nmm/s", wire, None, None),
+        ("gap, mm", 1e3 * record["gap_m"], None, None),
+    ]
+    on = np.concatenate(pieces)
+    shown = [c for c in curves if any(v is not None and np.isfinite(v[on]).any() for v in c[1:3])]
+    figure, axes = subplots(8.2, _INCH * len(shown) + 0.3, len(shown), 1, sharex=True, squeeze=False)
+    for ax, (name, measured, wanted, limit) in zip(axes[:, 0], shown, strict=True):
+        extremes = [] if limit is None else [*limit]
+        if limit is not None:
+            ax.axhspan(*limit, color=GREY, alpha=0.18, lw=0, label="limits")
+        for k, piece in enumerate(pieces):
+            label = "_" * bool(k)  # one piece is named in the legend
+            if measured is not None and np.isfinite(measured[on]).any():
+                smooth = _smooth(record["time_s"][piece], measured[piece])
+                ax.plot(s[piece], measured[piece], color=GREY, lw=0.5)
+                ax.plot(s[piece], smooth, color=OURS, lw=1.3, label=f"{label}measured")
+                extremes += [smooth.min(), smooth.max()]
+            if wanted is not None and np.isfinite(wanted[on]).any():
+                ax.plot(s[piece], wanted[piece], color=TORCH, lw=1.2, ls="--", label=f"{label}set")
+                extremes += [np.nanmin(wanted[on]), np.nanmax(wanted[on])]
+        low, high = min(extremes), max(extremes)
+        spare = max(0.25 * (high - low), 0.1 * abs(high), 1e-3)
+        ax.set_ylim(low - spare, high + spare)
+        ax.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="lower center")
+        plain(ax, "", name)
+    axes[-1, 0].set_xlabel("along the seam, mm")
+    return svg(figure, *axes[:, 0])
+
+
+def _smooth(t: Array, value: Array) -> Array:
+    """The running mean (N,) over _SMOOTH_S."""
+    known = np.nan_to_num(value)
+    total = np.concatenate([[0.0], np.cumsum(known)])
+    first = np.searchsorted(t, t - 0.5 * _SMOOTH_S)
+    last = np.searchsorted(t, t + 0.5 * _SMOOTH_S, side="right")
+    return np.asarray((total[last] - total[first]) / (last - first))

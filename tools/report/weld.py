@@ -27,8 +27,8 @@ from weldcal.systems.station import Truth
 from weldcal.tools.report.render import csv_text
 from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
-from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics, wire_angles
-from weldcal.welding.record.weave import MeasuredWeave, measure_weave
+from weldcal.welding.record.process import PathError, path_error, wire_angles
+from weldcal.welding.record.welded_seam import touch_numbers
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
@@ -91,11 +91,8 @@ class WeldOutcome:
     true_seam: SeamCurve | None
     planned: SeamCurve | None
     error: PathError | None  # torch while the arc burned
-    speed: SpeedStatistics | None
     plan_error: PathError | None  # of the newest plan, that of the last seam
     seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
-    weave: tuple[MeasuredWeave | None, ...] = ()  # of each seam, where a weave was ordered
-    path: Array | None = None  # (N, 3) m of the torch, without its weave
     plans: tuple[tuple[int, int], ...] = ()  # numbers of seam and pass of each of `seams`, from 0
 
 
@@ -258,13 +255,10 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
-        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, plan_error=plan_error)
     weave, passes = cell.job.servo_config.weave, cell.scenario.welding.later_passes()
-    parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
-    if not parts:
-        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
     plans = dict(enumerate((record.seam, record.weld_pass) for record in planned.records))
-    path, errors, woven, judged = log.p_BTorch.copy(), [], [], []
+    errors, judged = [], []
     for k, part in enumerate(welds(log)):
         of_seam, of_pass = plans.get(k, (k, 0))
         on, true = part & log.torch_on, true_seam(cell.station.truth, of_seam)
@@ -276,30 +270,11 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
             continue
         off = path_error(log.p_BTorch[on], curve, backwards=order.reverse)
         if weave.amplitude_m:
-            woven.append(measure_weave(log.time[on], off, weave.period_s, weave.plane_rad))
             off = _unwoven(log.time[on], off, weave)
-            path[on] = curve.position(off.s) + (off.lateral * curve.normal(off.s).T + off.height * curve.up(off.s).T).T
         if true is not None:
             errors.append(off)
             judged.append((of_seam, of_pass))
-    speeds = []
-    for k, part in enumerate(parts):
-        wanted = cell.job.servo_config.weld_speed_m_s
-        if of_pass := plans.get(k, (k, 0))[1]:
-            wanted = passes[of_pass - 1].speed_m_s or wanted
-        stretches = burns(log, part) if cell.job.servo_config.stitch.on_m else [part]
-        speeds += [speed_statistics(log.time[p], path[p], log.torch_on[p], wanted) for p in stretches]
-    speed = _together(speeds)
-    outcome = WeldOutcome(
-        log=log,
-        true_seam=seam,
-        planned=plan,
-        error=None,
-        speed=speed,
-        plan_error=plan_error,
-        weave=tuple(woven),
-        path=path,
-    )
+    outcome = WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, plan_error=plan_error)
     if not errors:
         return outcome
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
@@ -340,10 +315,9 @@ def pass_documents(weld: WeldOutcome, passes: Sequence[WeldPass], errors: list[d
     return found
 
 
-def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
-    """The ordered weave and the measured one of each seam; the mean path off the seam where a simulation knows that."""
-    dwell_s, known = order.dwell_left_s + order.dwell_right_s, weld.error is not None
-    ordered = {
+def ordered_weave(order: WeaveConfig) -> dict[str, Any]:
+    """Return what is ordered of a weave."""
+    return {
         "shape": order.shape,
         "amplitude_mm": 1e3 * order.amplitude_m,
         "frequency_hz": order.frequency_hz,
@@ -351,58 +325,18 @@ def weave_document(weld: WeldOutcome, order: WeaveConfig) -> dict[str, object]:
         "bow_mm": 1e3 * order.lag_m,
         "plane_deg": float(np.degrees(order.plane_rad)),
     }
-    mean = order.amplitude_m * (order.dwell_left_s - order.dwell_right_s) / order.period_s
-    middle = mean * np.array([np.cos(order.plane_rad), np.sin(order.plane_rad)])
-    measured = [
-        None
-        if m is None
-        else {
-            "amplitude_mm": 1e3 * m.amplitude_m,
-            "frequency_hz": 1.0 / (m.period_s - dwell_s),
-            "bow_mm": 1e3 * m.bow_m,
-            "mean_path_mm": 1e3 * float(np.hypot(*(np.array([m.left_m, m.up_m]) - middle))) if known else None,
-            "swings": m.swings,
-        }
-        for m in weld.weave
-    ]
-    return {"ordered": ordered, "measured": measured}
-
-
-def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
-    """The statistics of several welds, each weighted by its length."""
-    length = np.array([w.welded_m for w in welds])
-    means = np.array([w.mean for w in welds])
-    mean = float(means @ length / length.sum())
-    spread = np.array([w.cv * w.mean for w in welds]) ** 2 + (means - mean) ** 2
-    return SpeedStatistics(
-        mean=mean,
-        least=min(w.least for w in welds),
-        most=max(w.most for w in welds),
-        cv=float(np.sqrt(spread @ length / length.sum())) / mean if mean else 0.0,
-        outside_m=sum(w.outside_m for w in welds),
-        welded_m=float(length.sum()),
-        seconds=sum(w.seconds for w in welds),
-    )
 
 
 def weld_numbers(phase: Array) -> NDArray[np.int_]:
     """The number (N,) of the weld of each row: one begins where the tip is brought into touch again."""
-    touching = phase == PHASE_CODES[Phase.TOUCH]
-    return np.asarray(np.cumsum(touching & ~np.concatenate([[True], touching[:-1]])))
+    held = np.isin(phase, (PHASE_CODES[Phase.HELD], PHASE_CODES[Phase.BACK]))
+    return touch_numbers(phase == PHASE_CODES[Phase.TOUCH], held)
 
 
 def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
     """Masks (N,) of the log's rows, one for each weld."""
     number = weld_numbers(log.telemetry["phase"])
     return [number == k for k in range(int(number[-1]) + 1)]
-
-
-def burns(log: WeldLog, part: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Masks (N,) of the stretches of a part (N,) along which the torch was on without a pause."""
-    on = part & log.torch_on
-    number = np.cumsum(on & ~np.concatenate([[False], on[:-1]]))
-    found = [on & (number == k) for k in range(1, int(number[-1]) + 1)]
-    return [stretch for stretch in found if stretch.sum() >= 30]
 
 
 def felt_seams(run: Run[WeldJob]) -> list[bool]:

@@ -1,12 +1,13 @@
-"""Write the record of a welded part: record.html, record.json, record.csv, pictures, and the report's section."""
+"""Write the record of a welded part: record.html, record.json, record.csv, and the report's section."""
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,79 +16,44 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
+from weldcal.systems.messages import SeamRecord
 from weldcal.systems.runner import Run
-from weldcal.tools.report.pictures import GREY, OURS, TORCH, plain, subplots, svg
+from weldcal.tools.report.plots_weld import arc_along_seam
 from weldcal.tools.report.render import fixed, mappings_csv, render, write_atomic, write_json
-from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, ordered_angles
+from weldcal.tools.report.weld import (
+    WeldLog,
+    WeldOutcome,
+    columns,
+    felt_seams,
+    ordered_angles,
+    ordered_weave,
+    weld_numbers,
+)
 from weldcal.welding.record.order import RANGES, OrderLimits, WeldOrder
 from weldcal.welding.record.process import speed_along
-from weldcal.welding.record.progress import Progress
-from weldcal.welding.record.weld_log import WeldRecord, load_weld_log
+from weldcal.welding.record.progress import Progress, Stretch
+from weldcal.welding.record.weld_log import CSV_NAME, NO_LOG, WeldRecord, load_weld_log
 from weldcal.welding.record.welded_seam import (
+    DONE,
     MEASURED,
     RECORD_COLUMNS,
     SET,
     UNKNOWN,
+    ArcPiece,
     Spread,
     WeldedSeam,
+    arc_pieces,
+    evenness,
+    ordered,
     record_row,
     seam_rows,
     welded_seam,
+    with_overlaps,
 )
 from weldcal.welding.servo.state import Phase
 
-_SMALL = 8
-_INCH = 1.35  # height of one curve
-_SMOOTH_S = 0.2  # a choice: a reader's eye takes the mean of a pulsed or noisy arc
-
-
-def arc_over_time(record: WeldRecord, rows: NDArray[np.bool_], limits: OrderLimits) -> bytes | None:
-    """Draw current, voltage, wire feed, travel speed and gap while the arc of these rows (N,) burns; None without one.
-
-    Measured values are lines, set values dashed, limits grey bands.
-    """
-    on = np.flatnonzero(rows & record.arc)
-    if len(on) < 3:
-        return None
-    t = record["time_s"][on] - record["time_s"][on[0]]
-    curves = [
-        ("current, A", record["current_A"][on], record["set_current_A"][on], limits.current_A),
-        ("voltage, V", record["voltage_V"][on], record["set_voltage_V"][on], limits.voltage_V),
-        ("wire feed,\nm/min", None, record["set_wire_feed_m_min"][on], None),
-        ("travel speed,\nmm/s", 1e3 * record["torch_speed_m_s"][on], None, limits.speed_mm_s),
-        ("gap, mm", 1e3 * record["gap_m"][on], None, None),
-    ]
-    shown = [c for c in curves if any(v is not None and np.isfinite(v).any() for v in c[1:3])]
-    figure, axes = subplots(8.2, _INCH * len(shown) + 0.3, len(shown), 1, sharex=True, squeeze=False)
-    for ax, (name, measured, wanted, limit) in zip(axes[:, 0], shown, strict=True):
-        if limit is not None:
-            ax.axhspan(*limit, color=GREY, alpha=0.18, lw=0, label="limits")
-        if measured is not None and np.isfinite(measured).any():
-            ax.plot(t, measured, color=GREY, lw=0.5)
-            ax.plot(t, _smooth(t, measured), color=OURS, lw=1.3, label="measured")
-        if wanted is not None and np.isfinite(wanted).any():
-            ax.plot(t, wanted, color=TORCH, lw=1.2, ls="--", label="set")
-        low, high = ax.get_ylim()
-        ax.set_ylim(min(low, 0.0) if name.startswith(("travel", "gap")) else low, high)
-        ax.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="lower center")
-        plain(ax, "", name)
-    axes[-1, 0].set_xlabel("time from the established arc, s")
-    return svg(figure, *axes[:, 0])
-
-
-def _smooth(t: Array, value: Array) -> Array:
-    """The running mean (N,) over _SMOOTH_S."""
-    known = np.nan_to_num(value)
-    total = np.concatenate([[0.0], np.cumsum(known)])
-    first = np.searchsorted(t, t - 0.5 * _SMOOTH_S)
-    last = np.searchsorted(t, t + 0.5 * _SMOOTH_S, side="right")
-    return np.asarray((total[last] - total[first]) / (last - first))
-
-
-RECORD_HTML, RECORD_JSON, RECORD_CSV, PICTURES = "record.html", "record.json", "record.csv", "pictures"
+RECORD_HTML, RECORD_JSON, RECORD_CSV = "record.html", "record.json", "record.csv"
 PHASE_NAMES = [str(phase) for phase in Phase]
-ENDS = ("start", "end")
-_PICTURE_KEYS = tuple(f"picture_{end}" for end in ENDS)
 _WORDS = {
     "heat_input_kJ_mm": ("heat input", "kJ/mm", 2),
     "speed_mm_s": ("travel speed", "mm/s", 1),
@@ -104,18 +70,51 @@ _SOURCES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PartRecord:
-    """The record of a part: its order, its weld log, the welded seams, and PNG pictures by name.
+    """The record of a part: its order, the joined log of all runs, the welded seams, and the pieces of all of them.
 
-    `stretches`: rows of what was welded without a break; `lost`: a sentence for each stretch without a log.
+    `own`: log of the newest run, whose number is `run`; None: it has none. `lost`: a sentence for each stretch without
+    a log.
     """
 
     order: WeldOrder
     log: WeldRecord
     seams: tuple[WeldedSeam, ...]
-    pictures: dict[str, bytes]
     plots: dict[tuple[int, int], bytes]  # of the arc, by the numbers of seam and pass from 1
-    stretches: Sequence[dict[str, object]] = ()
+    pieces: Sequence[ArcPiece] = ()
     lost: tuple[str, ...] = ()
+    own: WeldRecord | None = None
+    run: int = 1
+
+    @property
+    def broke_off(self) -> list[str]:
+        """A sentence for each piece whose arc went out before its end."""
+        found = []
+        for k, piece in enumerate(self.pieces):
+            if piece.ended == DONE:
+                continue
+            then = next((p for p in self.pieces[k + 1 :] if p.name == piece.name), None)
+            on = "nothing was welded after it"
+            if then is not None:
+                where = "it" if then.run == piece.run else f"run {then.run}"
+                on = f"{where} went on at {then.from_mm:.0f} mm, {then.overlap_mm:.0f} mm over the weld"
+            broke = f"the arc broke off at {piece.to_mm:.0f} mm in run {piece.run} ({piece.ended.rstrip('.')})"
+            found.append(f"Seam {piece.name}: {broke}; {on}.")
+        return found
+
+    @property
+    def welded_mm(self) -> float:
+        """Length of weld of all seams and passes, what was welded twice once."""
+        return sum(seam.welded_mm for seam in self.seams)
+
+    def piece_rows(self) -> list[tuple[str, ...]]:
+        """Rows of the pages: seam, run, from, to, how it ended, overlap, start, end."""
+        return [
+            (
+                *(p.name, str(p.run), fixed(p.from_mm, 1), fixed(p.to_mm, 1), p.ended, fixed(p.overlap_mm, 1)),
+                *(at.replace("T", " ").partition(".")[0] for at in (p.start, p.end)),
+            )
+            for p in self.pieces
+        ]
 
     @property
     def outside(self) -> list[str]:
@@ -124,15 +123,17 @@ class PartRecord:
 
     def _outside(self) -> list[str]:
         return [
-            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name, 2)}, and the limit is"
-            f" {_limit(self.order, name)}."
+            f"Seam {seam.name}: {_WORDS[name][0]} is {_known(seam, name)}, and the limit is {_limit(self.order, name)}."
             for seam in self.seams
             for name in seam.outside(self.order.limits)
         ]
 
     def summary(self) -> dict[str, object]:
-        """What `--json` holds of the record; empty without an order."""
-        return {} if self.order.empty else {"order": self.order.document(), "outside_limits": self.outside}
+        """What `--json` holds of the record."""
+        order = {} if self.order.empty else {"order": self.order.document(), "outside_limits": self.outside}
+        weld = {"torch_speed_cv": evenness(self.log), "welded_mm": self.welded_mm}
+        arcs = {"arc_mm": [seam.arc_mm for seam in self.seams], "pieces": [asdict(p) for p in self.pieces]}
+        return order | arcs | (weld if self.seams else {})
 
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the report: seam, figure, least to largest value, mean, limit, verdict."""
@@ -143,18 +144,26 @@ class PartRecord:
         found: list[tuple[str, ...]] = []
         outside = seam.outside(self.order.limits)
         for name, (words, unit, digits) in _WORDS.items():
-            limit = _limit(self.order, name)
+            limit, value = _limit(self.order, name), _spread(seam, name)
             verdict = "" if limit == "–" else "outside" if name in outside else "within"
-            mean = fixed(_spread(seam, name).mean, digits)
-            if mean == limit == "–":  # neither known nor ordered
-                continue
-            found.append((f"{words}, {unit}", _range(seam, name), mean, limit, verdict))
+            if math.isfinite(value.mean) or limit != "–":  # known, or ordered
+                found.append(_row(f"{words}, {unit}", value, digits, limit, verdict))
         orders = self.log.settings.get("angles") or []
         order = (orders[seam.seam - 1] if seam.weld_pass == 1 and seam.seam <= len(orders) else None) or {}
         for name, value in seam.angles.items():
             wanted = "–" if order.get(name) is None else " to ".join(f"{v:g}" for v in np.ravel(order[name]))
-            between = f"{fixed(value.least, 1)} to {fixed(value.most, 1)}"
-            found.append((f"{name[:-4].replace('_', ' ')}, deg", between, fixed(value.mean, 1), wanted, ""))
+            found.append(_row(f"{name[:-4].replace('_', ' ')}, deg", value, 1, wanted))
+        order = ordered(self.log, (seam.seam - 1, seam.weld_pass - 1))
+        if weave := order.get("weave"):
+            for key, words in (("amplitude_mm", f"weave ({weave['shape']}), mm"), ("frequency_hz", "weave, Hz")):
+                found.append(_row(words, Spread(mean=(seam.weave or {}).get(key, math.nan)), 2, fixed(weave[key], 2)))
+        if seam.weld_pass > 1:
+            offsets = f"{order['lateral_mm']:g} and {order['vertical_mm']:g}"
+            found.append(_row("pass, to the left and up, mm", Spread(), 1, offsets))
+        for tack in seam.tacks:
+            where = f"tack at {tack['from_mm']:g} to {tack['to_mm']:g} mm"
+            found.append(_row(f"{where}: travel angle, deg", tack["travel_angle_deg"], 1))
+            found.append(_row(f"{where}: {_WORDS['path_mm'][0]}, mm", tack["path_mm"], 2))
         return found
 
     def facts(self) -> list[tuple[str, str]]:
@@ -174,21 +183,19 @@ class PartRecord:
         """Write the files of the record into the result folder."""
         written = datetime.now(UTC).isoformat(timespec="seconds")
         common = {name: self.log.settings.get(name, "") for name in ("software", "scenario", "seed", "ended")}
-        rows = []
-        for seam in self.seams:
-            names = [f"seam_{seam.seam}_{end}" for end in ENDS]
-            files = [f"{PICTURES}/{name}.png" if name in self.pictures else "" for name in names]
-            rows.append(
-                record_row(
-                    seam, self.order, {**common, "written": written, **dict(zip(_PICTURE_KEYS, files, strict=True))}
-                )
+        broke = [(p.name, f"{p.to_mm:.1f}: {p.ended}") for p in self.pieces if p.ended != DONE]
+        rows = [
+            record_row(
+                seam,
+                self.order,
+                {**common, "written": written, "broke_off": "; ".join(at for n, at in broke if n == seam.name)},
             )
-        for name, picture in self.pictures.items():
-            write_atomic(folder / PICTURES / f"{name}.png", picture)
+            for seam in self.seams
+        ]
         write_atomic(folder / RECORD_CSV, mappings_csv(rows, RECORD_COLUMNS))
         document = {
             "schema": "weldcal weld record",
-            "version": 1,
+            "version": 2,
             "written": written,
             **common,
             "order": self.order.document(),
@@ -196,56 +203,45 @@ class PartRecord:
             "process": asdict(self.log.process),
             "schedule": self.log.settings.get("schedule"),
             "angles": self.log.settings.get("angles"),
-            "stretches": list(self.stretches),
-            "seams": [
-                asdict(seam) | {"outside": seam.outside(self.order.limits)} | {key: row[key] for key in _PICTURE_KEYS}
-                for seam, row in zip(self.seams, rows, strict=True)
-            ],
+            "ordered": self.log.settings.get("ordered"),
+            "pieces": [asdict(piece) for piece in self.pieces],
+            "broke_off": self.broke_off,
+            "welded_mm": self.welded_mm,
+            "seams": [asdict(seam) | {"outside": seam.outside(self.order.limits)} for seam in self.seams],
         }
         write_json(folder / RECORD_JSON, document)
         write_atomic(folder / RECORD_HTML, self.page(written))
-
-    def _ends_of(self, seam: int) -> bytes | None:
-        """The pictures of a seam's start and end side by side, PNG; None without them."""
-        names = [f"seam_{seam}_{end}" for end in ENDS]
-        grey = [cv2.imdecode(np.frombuffer(self.pictures[n], np.uint8), 0) for n in names if n in self.pictures]
-        found = [np.pad(one, ((0, 0), (0, 8)), constant_values=255) for one in grey if one is not None]
-        tall = max((len(one) for one in found), default=0)
-        row = [np.pad(one, ((0, tall - len(one)), (0, 0)), constant_values=255) for one in found]
-        return cv2.imencode(".png", np.hstack(row))[1].tobytes() if row else None
 
     def page(self, written: str) -> str:
         """The record as one self-contained HTML text."""
         ended, seams = str(self.log.settings.get("ended", "")), len({seam.seam for seam in self.seams})
         passes = f" in {len(self.seams)} passes" if len(self.seams) > seams else ""
-        limited, what = self.order.limits != OrderLimits(), f"{seams} seam{'' if seams == 1 else 's'} welded{passes}"
-        tone, headline = ("good", f"{what}, within all limits") if limited else ("plain", f"{what}, no limits ordered")
+        what = f"{seams} seam{'' if seams == 1 else 's'} welded{passes}"
+        limited = self.order.limits != OrderLimits()
+        tone, judged = ("good", "pass, within all limits") if limited else ("plain", "not judged, no limits ordered")
         if self.outside:
-            tone, headline = "bad", f"{what}, {len(self.outside)} of the limits exceeded"
-        if ended not in ("", "done") or not seams:
-            tone, headline = "bad", f"{what}; the job was held"
-        cards = [
-            (f"Seam {seam.name}, heat input", fixed(seam.figures["heat_input_kJ_mm"].mean, 2), "kJ/mm", words)
-            for seam in self.seams
-            for words in [f"{seam.welded_mm:.0f} mm in {seam.arc_s:.1f} s; arc values {_SOURCES[seam.arc_values]}"]
-        ]
+            tone, judged = "bad", f"fail, {len(self.outside)} of the limits exceeded"
+        if ended not in ("", DONE) or not seams:
+            tone, judged = "bad", "fail, the weld is not complete"
+        who = f"Part {self.order.part or 'not named'}, operator {self.order.operator or 'not named'}"
         return render(
             "weld_record.html.j2",
             record=self,
             order=self.order,
             plots=self.plots,
-            pictures={seam.seam: picture for seam in self.seams if (picture := self._ends_of(seam.seam)) is not None},
-            cards=cards,
+            sources=_SOURCES,
             written=written.replace("T", " ").replace("+00:00", " UTC"),
             simulated=self.log.settings.get("robot") == "simulated",
             tone=tone,
-            headline=headline,
-            sentence=ended if tone == "bad" and ended not in ("", "done") else "",
+            headline=f"{who}: {judged}; {what}",
+            sentence=" ".join([*([] if ended in ("", DONE) else [ended]), *self.broke_off]),
         )
 
 
-def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
-    """The weld record from the log; it contains no ground truth of the simulation."""
+def weld_record(
+    run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str, number: int = 1
+) -> WeldRecord:
+    """The weld record of the run of this number from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
     speed = travel_speed = speed_along(log.time, log.p_BW)
@@ -265,9 +261,12 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     scheduled = np.full((len(log.time), 5), np.nan) if log.scheduled is None else log.scheduled
     names = ("set_wire_feed_m_min", "set_voltage_V", "set_current_A", "gap_m")
     table |= {name: scheduled[:, k] for k, name in enumerate(names, start=1)}
+    records = cell.job.planned_seam(run.root).records
+    table |= dict(zip(("s_seam_m", "left_m", "up_m"), places(log, records, moving), strict=True))
     known = np.where(np.isfinite(arc[:, 1:]), arc[:, 1:], scheduled[:, [3, 2]])  # current and voltage
     table |= {
         "torch_speed_m_s": speed,
+        "travel_speed_m_s": travel_speed,
         "torch_speed_commanded_m_s": named["torch_speed"],
         "tip_speed_m_s": named["tip_speed"],
         "omega_rad_s": named["omega"],
@@ -291,7 +290,9 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "crater_s": cell.scenario.welding.arc.crater_s,
         "woven": bool(config.weave.amplitude_m),
         "felt": felt_seams(run),
-        "plans": [(plan.seam, plan.weld_pass) for plan in cell.job.planned_seam(run.root).records],
+        "plans": [(plan.seam, plan.weld_pass) for plan in records],
+        "arcs": burned_arcs(run, log, number),
+        "ordered": ordered_passes(run),
         "ended": run.reason or "done",
         "order": cell.scenario.welding.order.document(),
         "angles": ordered_angles(run),
@@ -301,78 +302,135 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     return WeldRecord(table, phase, process, settings)
 
 
-def part_record(run: Run[WeldJob], log: WeldRecord, progress: Progress | None = None) -> PartRecord:
-    """The record of a finished run from its weld log; without a seam where no arc burned.
+def places(log: WeldLog, records: Sequence[SeamRecord], moving: NDArray[np.bool_]) -> Array:
+    """Where the torch is along the whole seam, left of and above the planned line (3, N), m; NaN before it moves."""
+    found, number = np.full((3, len(log.time)), np.nan), weld_numbers(log.telemetry["phase"])
+    for k, plan in enumerate(records):
+        rows = np.flatnonzero(moving & (number == k))
+        if plan.line is None or not len(rows):
+            continue
+        at, guess, s = 0.0, log.telemetry["s_torch"][rows], np.empty(len(rows))
+        for i, row in enumerate(rows):
+            s[i] = at = plan.line.nearest(log.p_BW[row], at if math.isnan(guess[i]) else guess[i])
+        gap = log.p_BW[rows] - plan.line.position(s)
+        beside = [np.sum(gap * axis(s), axis=1) for axis in (plan.line.normal, plan.line.up)]
+        found[:, rows] = (plan.place(s), *beside)
+    return found
 
-    `progress`: where the run went on with a broken weld, the record joins the logs of all its runs.
+
+def burned_arcs(run: Run[WeldJob], log: WeldLog, number: int) -> list[dict[str, object]]:
+    """Of each arc of the log: the run's number, when it was lit and went out, and how it ended."""
+    lit = np.flatnonzero(log.torch_on & ~np.concatenate([[False], log.torch_on[:-1]]))
+    found: list[dict[str, object]] = []
+    for row in lit:
+        arc = min(run.arcs, key=lambda one: abs(one.on_s - log.time[row]))
+        ended = f"held by an operator ({arc.held_by})" if arc.held_by else DONE
+        found.append({"run": number, "start": arc.start, "end": arc.end, "ended": ended})
+    phases = [name for name, _, _ in run.phases if name != "held"]
+    finished = log.telemetry["phase"][-1] == PHASE_CODES[Phase.FINISH] and not log.torch_on[-1]
+    if found and run.held and phases[-1:] == ["weld"] and not finished and found[-1]["ended"] == DONE:
+        found[-1]["ended"] = run.reason or "the job was held"
+    return found
+
+
+def ordered_passes(run: Run[WeldJob]) -> list[dict[str, Any]]:
+    """What is ordered of each pass of each seam, numbers from 1."""
+    welding, config = run.cell.scenario.welding, run.cell.job.servo_config
+    weave = None
+    if config.weave.amplitude_m:
+        weave = ordered_weave(config.weave) | {"period_s": config.weave.period_s}
+    found = []
+    for seam in sorted(run.cell.job.travel.order):
+        tacks = [asdict(tack) for tack in welding.tacks if tack.seam == seam + 1]
+        root = {"seam": seam + 1, "pass": 1, "speed_mm_s": welding.speed_mm_s, "weave": weave, "tacks": tacks}
+        found.append(root)
+        for k, order in enumerate(welding.passes, start=2):
+            found.append(
+                root | asdict(order) | {"pass": k, "speed_mm_s": order.speed_mm_s or welding.speed_mm_s, "tacks": []}
+            )
+    return found
+
+
+def part_record(
+    order: WeldOrder, log: WeldRecord | None, progress: Progress | None = None, folder: Path | None = None
+) -> PartRecord:
+    """The record of a weld from the log of its newest run; without a seam where no arc burned.
+
+    `progress`: of all its runs, whose logs are in `folder`; without a log of the newest one it is the record of a run
+    that was killed.
     """
-    lost: list[str] = []
-    if progress is not None:
-        log, lost = with_earlier_logs(log, progress)
-    plans: list[tuple[int, int]] = [(seam, number) for seam, number in log.settings["plans"]]
-    order, of_seam = run.cell.scenario.welding.order, list(seam_rows(log, plans))
-    seams = [welded_seam(log, numbers, rows) for numbers, rows in of_seam]
-    plots = {numbers: arc_over_time(log, rows, order.limits) for numbers, rows in of_seam}
-    pictures = {
-        f"seam_{seam + 1}_{end}": cv2.imencode(".png", image.pixels)[1].tobytes()
-        for seam, images in run.seam_pictures.items()
-        for end, image in zip(ENDS, images, strict=False)
-        if image.pixels.size
-    }
+    own, logs, lost, run = log, [], [], 1
+    if progress is not None and folder is not None:
+        run = len(progress.ends)
+        for k in range(run - (own is not None)):
+            try:
+                logs.append(load_weld_log(run_log(folder, k + 1), whole=False))
+            except InputError:
+                lost += [one for one in progress.stretches if one.run == k]
+    logs += [] if own is None else [own]
+    joined = functools.reduce(lambda earlier, later: later.after(earlier), logs) if logs else NO_LOG
+    if own is None and progress is not None:
+        joined = replace(joined, settings={**joined.settings, "ended": progress.ends[-1]})
+    plans: list[tuple[int, int]] = [(seam, number) for seam, number in joined.settings.get("plans", ())]
+    pieces = [_lost_piece(one, lost, progress.ends) for one in lost] if progress is not None else []
+    pieces = with_overlaps(sorted([*pieces, *arc_pieces(joined, plans)], key=lambda piece: piece.run))
+    of_seam = dict(seam_rows(joined, plans))
+    for piece in pieces:
+        of_seam.setdefault((piece.seam - 1, piece.weld_pass - 1), np.zeros(len(joined), dtype=bool))
+    seams = [
+        welded_seam(joined, (n, m), rows) or WeldedSeam(seam=n + 1, weld_pass=m + 1)
+        for (n, m), rows in sorted(of_seam.items())
+    ]
+    plots = {(n + 1, m + 1): arc_along_seam(joined, rows, order.limits) for (n, m), rows in of_seam.items()}
     return PartRecord(
         order=order,
-        log=log,
-        seams=tuple(seam for seam in seams if seam is not None),
-        pictures=pictures,
-        plots={(seam + 1, number + 1): plot for (seam, number), plot in plots.items() if plot is not None},
-        stretches=[] if progress is None else stretch_rows(progress),
-        lost=tuple(lost),
+        log=joined,
+        seams=tuple(found for seam in seams if (found := seam.joined(pieces)).arc_mm),
+        plots={numbers: plot for numbers, plot in plots.items() if plot is not None},
+        pieces=pieces,
+        lost=tuple(
+            f"Seam {one.seam + 1}: {1e3 * one.from_m:.0f} to {1e3 * one.to_m:.0f} mm were welded in run {one.run + 1},"
+            " whose log is lost."
+            for one in lost
+        ),
+        own=own,
+        run=run,
     )
 
 
-def with_earlier_logs(log: WeldRecord, progress: Progress) -> tuple[WeldRecord, list[str]]:
-    """The weld log behind those of the earlier runs of a broken weld, and a sentence for each log that is lost."""
-    lost = []
-    for k in reversed(range(len(progress.folders) - 1)):
-        welded = [one for one in progress.stretches if one.run == k]
-        try:
-            log = log.after(load_weld_log(Path(progress.folders[k])))
-            break  # it holds those before it
-        except InputError:
-            lost += [
-                f"Seam {one.seam + 1}: {1e3 * one.from_m:.0f} to {1e3 * one.to_m:.0f} mm were welded in a run whose log"
-                " is lost."
-                for one in welded
-            ]
-    return log, lost
+def run_log(folder: Path, number: int) -> Path:
+    """The table of one run of a weld that broke off, by its number from 1."""
+    return folder / CSV_NAME.replace(".", f"-{number}.")
 
 
-def stretch_rows(progress: Progress) -> list[dict[str, object]]:
-    """What record.json holds of each stretch that was welded without a break."""
-    return [
-        {
-            "seam": one.seam + 1,
-            "from_mm": round(1e3 * one.from_m, 1),
-            "to_mm": round(1e3 * one.to_m, 1),
-            "ended": one.time,
-            "folder": progress.folders[one.run],
-        }
-        for one in progress.stretches
-    ]
+def _lost_piece(one: Stretch, lost: Sequence[Stretch], ends: Sequence[str]) -> ArcPiece:
+    last = one is [other for other in lost if other.run == one.run][-1]
+    return ArcPiece(
+        seam=one.seam + 1,
+        weld_pass=one.weld_pass + 1,
+        run=one.run + 1,
+        from_mm=1e3 * one.from_m,
+        to_mm=1e3 * one.to_m,
+        start=one.begun,
+        end=one.time,
+        ended=ends[one.run] if last and not one.done else DONE,
+    )
+
+
+def _row(words: str, value: Spread, digits: int, wanted: str = "–", verdict: str = "") -> tuple[str, ...]:
+    """A row of the pages: the figure, least to largest value, mean, what was ordered, verdict."""
+    between = f"{fixed(value.least, digits)} to {fixed(value.most, digits)}" if math.isfinite(value.least) else "–"
+    return words, between, fixed(value.mean, digits), wanted, verdict
 
 
 def _spread(seam: WeldedSeam, name: str) -> Spread:
     return seam.figures[name] if name in RANGES else seam.path_mm
 
 
-def _known(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
-    known = math.isfinite(_spread(seam, name).mean)
-    return f"{_range(seam, name, more_digits)} {_WORDS[name][1]}" if known else "not known"
-
-
-def _range(seam: WeldedSeam, name: str, more_digits: int = 0) -> str:
-    value, digits = _spread(seam, name), _WORDS[name][2] + more_digits
-    return f"{fixed(value.least, digits)} to {fixed(value.most, digits)}"
+def _known(seam: WeldedSeam, name: str) -> str:
+    value, (_, unit, digits) = _spread(seam, name), _WORDS[name]
+    between = f"{fixed(value.least, digits + 2)} to {fixed(value.most, digits + 2)} {unit}"
+    return between if math.isfinite(value.mean) else "not known"
 
 
 def _limit(order: WeldOrder, name: str) -> str:

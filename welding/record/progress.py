@@ -2,7 +2,9 @@
 
 import json
 import math
+import time
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +16,8 @@ from weldcal.models.files import LARGEST_TEXT, read_text, write_durable
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.restart import Restart
 
-SCHEMA, VERSION = "weldcal weld progress", 1
+KILLED, POWER = "killed", "cut off: power was lost, or the computer was restarted"
+SCHEMA, VERSION = "weldcal weld progress", 2
 PROGRESS_NAME, CRATERS_NAME = "progress.json", "craters.jsonl"
 
 
@@ -27,10 +30,10 @@ class Stretch:
     """A stretch of a seam on which the arc burned without a break.
 
     Attributes:
-        seam, piece: numbers from 0; run: number of the run from 0, by Progress.folders.
+        seam, piece, weld_pass: numbers from 0; run: number of the run from 0, by Progress.ends.
         from_m, to_m: along the whole seam.
         done: the seam, or its piece, ends there.
-        time: when the arc went out, ISO 8601.
+        begun, time: when the arc was lit and went out, ISO 8601.
     """
 
     seam: int
@@ -40,10 +43,16 @@ class Stretch:
     to_m: float
     done: bool
     time: str
+    weld_pass: int = 0
+    begun: str = ""
 
     def same_arc(self, other: Self) -> bool:
         """Whether the other one has the same beginning in the same run."""
-        return all(getattr(self, k) == getattr(other, k) for k in ("seam", "piece", "run", "from_m"))
+        return all(getattr(self, k) == getattr(other, k) for k in ("seam", "piece", "weld_pass", "run", "from_m"))
+
+    def longer(self, other: Self) -> bool:
+        """Whether it is at least as long as the other one."""
+        return abs(self.to_m - self.from_m) >= abs(other.to_m - other.from_m)
 
     def line(self, p_BCrater: Array) -> str:
         """The line of the crater record: this stretch, and the torch (3,) m at its end."""
@@ -57,19 +66,17 @@ class Progress:
     Attributes:
         scenario, seed, robot: as they were given; robot None: the scenario's.
         scenario_sha256: of the scenario's files beside the progress.
-        folders: results of the runs, this one last; continued_in: that of the run that went on from here.
+        ends: how each run ended, this one last; empty: it has not, or nobody saw it end.
         stretches: that are welded, in order.
         seam, piece: numbers from 0 of what is welded next, or again from its crater; done: nothing is.
         p_BCrater, p_BBegin, felt, X_BP, sigma_m: see Restart.
-        X_BC: (4, 4), pose of the scanner; None: not known.
     """
 
     scenario: str
     seed: int
     robot: str | None
     scenario_sha256: str
-    folders: tuple[str, ...]
-    continued_in: str = ""
+    ends: tuple[str, ...] = ("",)
     stretches: tuple[Stretch, ...] = ()
     seam: int = 0
     piece: int = 0
@@ -79,20 +86,22 @@ class Progress:
     felt: Array | None = None
     X_BP: Array | None = None
     sigma_m: float = math.nan
-    X_BC: Array | None = None
 
     def restart(self, overlap_m: float) -> Restart:
         """Where the weld goes on."""
-        return Restart(
-            seam=self.seam,
-            piece=self.piece,
-            p_BCrater=self.p_BCrater,
-            p_BBegin=self.p_BBegin,
-            felt=self.felt,
-            X_BP=self.X_BP,
-            sigma_m=self.sigma_m,
-            overlap_m=overlap_m,
-        )
+        last = self.stretches[-1] if self.stretches and self.p_BCrater is not None else None
+        same = {
+            name: getattr(self, name) for name in ("seam", "piece", "p_BCrater", "p_BBegin", "felt", "X_BP", "sigma_m")
+        }
+        return Restart(**same, overlap_m=overlap_m, crater_m=math.nan if last is None else last.to_m)
+
+    def settled(self) -> Self:
+        """The progress with the end of a last run that nobody saw: whether its computer was started again after it."""
+        if self.ends[-1]:
+            return self
+        boot = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else 0.0
+        last = max((datetime.fromisoformat(one.time).timestamp() for one in self.stretches), default=math.inf)
+        return replace(self, ends=(*self.ends[:-1], POWER if last < boot else KILLED))
 
     def with_stretch(self, stretch: Stretch) -> Self:
         """The progress with a new stretch, or with a newer end of the last one."""
@@ -109,8 +118,8 @@ class Progress:
             p_BCrater = np.array((x, y, z), dtype=float)
         except (TypeError, ValueError):
             return self
-        last, here = self.stretches[-1] if self.stretches else None, (self.seam, self.piece, len(self.folders) - 1)
-        old = last is not None and last.same_arc(stretch) and (last.done or last.to_m >= stretch.to_m)
+        last, here = self.stretches[-1] if self.stretches else None, (self.seam, self.piece, len(self.ends) - 1)
+        old = last is not None and last.same_arc(stretch) and (last.done or last.longer(stretch))
         if self.done or old or (stretch.seam, stretch.piece, stretch.run) != here:
             return self
         return replace(self.with_stretch(stretch), p_BCrater=p_BCrater)
@@ -128,7 +137,7 @@ class Progress:
 
 
 _LAST_LINES = 20  # a choice: a loss of power may damage the last ones
-_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4), "X_BC": (4, 4)}
+_ARRAYS = {"p_BCrater": (3,), "p_BBegin": (3,), "felt": (-1, 4), "X_BP": (4, 4)}
 
 
 def load_progress(folder: Path) -> Progress:
@@ -153,12 +162,11 @@ def load_progress(folder: Path) -> Progress:
         found = Progress(
             scenario=str(document["scenario"]),
             scenario_sha256=str(document["scenario_sha256"]),
-            continued_in=str(document["continued_in"]),
             seed=int(document["seed"]),
             seam=int(document["seam"]),
             piece=int(document["piece"]),
             robot=None if document["robot"] is None else str(document["robot"]),
-            folders=tuple(map(str, document["folders"])),
+            ends=tuple(map(str, document["ends"])),
             stretches=tuple(Stretch(**row) for row in document["stretches"]),
             done=bool(document["done"]),
             sigma_m=math.nan if sigma is None else 1e-3 * as_number(sigma),

@@ -20,15 +20,12 @@ class MeasuredWeave:
     Attributes:
         amplitude_m: mean half distance of its sides.
         period_s: of a swing to both sides, with its dwells; swings: how many whole ones are measured.
-        left_m, up_m: mean path off the seam, to the left and up.
         bow_m: how far the sides lag behind the middle along the seam.
     """
 
     amplitude_m: float
     period_s: float
     swings: int
-    left_m: float
-    up_m: float
     bow_m: float
 
 
@@ -42,8 +39,8 @@ def measure_weave(time: Array, error: PathError, period_s: float, plane_rad: flo
     rows = time - time[0] >= SETTLED_PERIODS * period_s
     if rows.sum() < 8:
         return None
-    t, s, left, up = time[rows], error.s[rows], error.lateral[rows], error.height[rows]
-    side = math.cos(plane_rad) * left + math.sin(plane_rad) * up
+    t, s = time[rows], error.s[rows]
+    side = math.cos(plane_rad) * error.lateral[rows] + math.sin(plane_rad) * error.height[rows]
     side = side - 0.5 * (side.max() + side.min())
     starts = _rising(t, side)
     if len(starts) < 3:
@@ -56,11 +53,8 @@ def measure_weave(time: Array, error: PathError, period_s: float, plane_rad: flo
     wave = side[whole] / amplitude
     A = np.column_stack([wave**2, t[whole], np.ones(len(wave))])
     bow = -float(np.linalg.lstsq(A, s[whole], rcond=None)[0][0])
-    means = (float(np.trapezoid(v[whole], t[whole]) / np.ptp(t[whole])) for v in (left, up))
     period = float(starts[-1] - starts[0]) / swings
-    return MeasuredWeave(
-        amplitude_m=amplitude, period_s=period, swings=swings, left_m=next(means), up_m=next(means), bow_m=bow
-    )
+    return MeasuredWeave(amplitude_m=amplitude, period_s=period, swings=swings, bow_m=bow)
 
 
 def _rising(t: Array, side: Array) -> Array:

@@ -92,11 +92,28 @@ COLUMNS: tuple[LogColumn, ...] = (
     LogColumn("set_voltage_V", "V", "", "voltage that the schedule sets; nan where it sets none"),
     LogColumn("set_current_A", "A", "", "current that the schedule sets; nan where it sets none"),
     LogColumn("gap_m", "m", "planned seam", "measured gap that the schedule follows; nan where it follows none"),
+    LogColumn(
+        "s_seam_m", "m", "whole seam", "place of the torch along the whole seam, from its start; nan before it touches"
+    ),
+    LogColumn(
+        "travel_speed_m_s", "m/s", "planned seam", "speed of the torch along the seam, without the swings of a weave"
+    ),
+    LogColumn("left_m", "m", "planned seam", "torch off the planned line of the tip, to the left of travel"),
+    LogColumn("up_m", "m", "planned seam", "torch off the planned line of the tip, upwards"),
 )
 BETWEEN_RUNS_S = 1.0  # a choice: longer than any hold counts as time of welding; the true time is in record.json
 _LATER = (
     *("arc", "current_A", "voltage_V"),
-    *("set_wire_feed_m_min", "set_voltage_V", "set_current_A", "gap_m"),
+    *(
+        "set_wire_feed_m_min",
+        "set_voltage_V",
+        "set_current_A",
+        "gap_m",
+        "s_seam_m",
+        "travel_speed_m_s",
+        "left_m",
+        "up_m",
+    ),
 )  # columns that logs of before do not have
 NAMES = tuple(c.name for c in COLUMNS)
 _NUMBERS = tuple(name for name in NAMES if name != "phase")
@@ -147,6 +164,7 @@ class WeldRecord:
         table = {name: np.concatenate([earlier[name][:n], self[name]]) for name in self.columns}
         table["time_s"] = np.concatenate([earlier["time_s"][:n], self["time_s"] - self["time_s"][0] + then])
         settings = {**self.settings, "plans": [*plans, *self.settings.get("plans", ())]}
+        settings["arcs"] = [*earlier.settings.get("arcs", ()), *self.settings.get("arcs", ())]
         return replace(self, columns=table, phase=np.concatenate([earlier.phase[:n], self.phase]), settings=settings)
 
     def points(self, name: str) -> Array:
@@ -157,6 +175,10 @@ class WeldRecord:
         """X_BW ("BW") or X_BT ("BT") at a row."""
         q = np.array([self.columns[f"q_{name}_{axis}"][row] for axis in "wxyz"])
         return RigidTransform(RotationMatrix(Quaternion(q / np.linalg.norm(q))), self.points(f"p_{name}")[row])
+
+
+NO_LOG = WeldRecord({name: np.empty(0) for name in _NUMBERS}, np.empty(0, dtype=np.str_))
+"""Of runs whose logs are all lost."""
 
 
 def weld_log_texts(record: WeldRecord) -> tuple[str, str]:
@@ -194,18 +216,20 @@ def weld_log_texts(record: WeldRecord) -> tuple[str, str]:
     return text, json.dumps(header, indent=1, allow_nan=False) + "\n"
 
 
-def load_weld_log(path: Path | str) -> WeldRecord:
+def load_weld_log(path: Path | str, whole: bool = True) -> WeldRecord:
     """Read a weld log back.
 
     Args:
         path: the folder, its weld.csv or its weld.json.
+        whole: refuse it in a folder whose result is not finished.
 
     Raises:
         WeldLogError: one sentence that says what is missing, damaged or of another version.
     """
     given = Path(path)
     folder = given if given.is_dir() else given.parent
-    require_whole(folder)
+    if whole:
+        require_whole(folder)
     stem = CSV_NAME.removesuffix(".csv") if given.is_dir() else given.stem
     header_path, csv_path = folder / f"{stem}.json", folder / f"{stem}.csv"
     header = _header(_text(header_path), header_path)

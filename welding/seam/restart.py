@@ -38,6 +38,7 @@ class Restart:
         felt: (N, 4) m in B: the points that the tip felt beside the crater and ahead of it, and their lag.
         X_BP: (4, 4), registered pose of the part then; None: not known. sigma_m: of that registration.
         overlap_m: of seam that is welded twice.
+        crater_m: the crater's place on the whole seam, as the first run located that; NaN: as it is located now.
     """
 
     seam: int
@@ -48,6 +49,7 @@ class Restart:
     X_BP: Array | None = None
     sigma_m: float = math.nan
     overlap_m: float = 8e-3
+    crater_m: float = math.nan
 
     def check_unmoved(self, seam: SeamCurve, X_BP: RigidTransform | None, sigma_m: float) -> None:
         """Check that the part is where it was.
@@ -87,6 +89,7 @@ class Restart:
         if self.p_BCrater is None:
             return CutSeam(seam, None, from_m, from_m)
         crater = float(seam.project(self.p_BCrater))
+        from_m += float(np.nan_to_num(self.crater_m - from_m - crater))
         begin = 0.0 if self.p_BBegin is None else seam.nearest(self.p_BBegin, 0.0, NEAR_START_M)
         start = min(max(begin, crater - self.overlap_m), seam.length)
         last = seam.drawn_m if seam.drawn_m > seam.length + window_m else seam.length

@@ -18,6 +18,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.motion.guarded_path import Followed, GuardedMotion, InfeasiblePath, check_path, straight
+from weldcal.welding.passes.tacks import BESIDE_M
 from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -91,15 +92,24 @@ class Welder:
 
 
 def leaning(
-    config: ServoConfig, lean_rad: float, touch_arc_m: float | None = None, sigma_m: float = math.nan
+    config: ServoConfig,
+    lean_rad: float,
+    touch_arc_m: float | None = None,
+    sigma_m: float = math.nan,
+    begins_m: float = 0.0,
 ) -> ServoConfig:
-    """Settings of a servo that leans the tool, whose tip comes down elsewhere, and whose plan has a sigma."""
+    """Settings of a servo that leans the tool, whose tip comes down elsewhere, and whose plan has a sigma.
+
+    Of a plan that begins later on the whole seam, the tacks are at other places, and behind the tip there are none.
+    """
     if math.isfinite(sigma_m):
         # Two sigma above its plan is the root still likely; anything else that holds the ball there is refused.
         above_m = min(max(2.0 * sigma_m, 0.5 * config.tool.tip_drop_m), config.touch.above_m)
         config = dc.replace(config, touch=dc.replace(config.touch, above_m=above_m))
     if touch_arc_m is not None:
-        config = dc.replace(config, touch=dc.replace(config.touch, arc_m=touch_arc_m))
+        ahead = [tack for tack in config.tacks if tack.end - begins_m + BESIDE_M > touch_arc_m]
+        tacks = tuple(dc.replace(tack, start=tack.start - begins_m, end=tack.end - begins_m) for tack in ahead)
+        config = dc.replace(config, touch=dc.replace(config.touch, arc_m=touch_arc_m), tacks=tacks)
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 

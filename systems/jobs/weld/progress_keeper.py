@@ -17,15 +17,16 @@ from weldcal.models.files import write_apart
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import seam_tool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
-from weldcal.systems.messages import PlannedSeam
+from weldcal.systems.messages import PlannedSeam, SeamRecord
 from weldcal.systems.runner import Run
-from weldcal.welding.record.progress import CRATERS_NAME, Progress, Stretch, load_progress
+from weldcal.welding.record.progress import CRATERS_NAME, Progress, Stretch
 from weldcal.welding.servo.feel_start import mean_residual
 from weldcal.welding.servo.state import Phase, WeldingState
 
 RESTART: Final = "restart"
 """Folder of a result with the files of its scenario, from which the weld can go on."""
 EVERY_M, EVERY_S = 1.0e-3, 0.5  # a choice: the points that a restart needs are felt long before
+APART_M = 1.0e-3  # a choice: an arc that is lit so far behind the last one leaves a gap
 CRATER_M = 0.1e-3  # a choice: a tenth of what a restart may be off along the seam
 _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need again
 _SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
@@ -54,12 +55,14 @@ class ProgressKeeper:
         Args:
             folder: of the result.
             files: the scenario's, by name.
-            begun: the progress at the start, whose last folder is this one.
+            begun: the progress at the start, whose last end is that of this run.
         """
         self._folder, self._files, self._progress = folder, files, begun
         self._from_m, self._to_m, self._at, self._time = math.nan, -math.inf, -math.inf, -math.inf
-        self._plan, self._ended, self._lit = (0, 0, 0), (0, 0, 0), False
+        self._plan, self._ended, self._lit = (0, 0, 0, 0), (0, 0, 0, 0), False
+        self._line_on, self._begun = SeamRecord(seam=0), ""
         self._slot: tuple[Progress, WeldingState | None] | None = None
+        self._state: WeldingState | None = None
         self._line, self._line_m = "", -math.inf
         self._changed, self._closing = threading.Condition(), False
         self._threads: tuple[threading.Thread, ...] = ()
@@ -76,10 +79,6 @@ class ProgressKeeper:
         phase = job.command(root).phase
         if not self._threads:
             if phase in ("confirm", "approach_above"):
-                stated = run.cell.scenario.job.X_BC
-                X_BC = job.calibration_status(root).X_BC or (None if stated is None else stated.pose())
-                if X_BC is not None:
-                    self._progress = replace(self._progress, X_BC=X_BC.GetAsMatrix4())
                 work = {"progress": self._write, "craters": self._append}
                 self._threads = tuple(threading.Thread(target=w, name=n, daemon=True) for n, w in work.items())
                 for thread in self._threads:
@@ -87,10 +86,12 @@ class ProgressKeeper:
                 self._put(None)
             return
         report, planned = job.servo_report(root), job.planned_seam(root)
-        if report.plan_key != planned.key or planned.seam is None:
+        key = (*planned.key, planned.weld_pass)
+        if (*report.plan_key, report.weld_pass) != key or planned.seam is None:
             return
-        if report.plan_key != self._plan:
-            self._plan, self._from_m, self._to_m, self._at = report.plan_key, math.nan, -math.inf, -math.inf
+        if key != self._plan:
+            self._plan, self._from_m, self._to_m, self._at = key, math.nan, -math.inf, -math.inf
+            self._line_on = (SeamRecord(seam=0, line=planned.seam, begins_m=planned.begins_m), *planned.records)[-1]
             self._line_m = -math.inf
         state = report.state
         lit = phase == "weld" and report.torch_on and state is not None and state.arc_seen
@@ -108,9 +109,9 @@ class ProgressKeeper:
         assert state.plan_fit is not None
         p_BCrater = np.asarray(report.X_BT @ seam_tool(run.cell.scenario, run.cell.station, run.command.seam).p_TW)
         # while the tool stands for its arc, s_torch is the place where it began to come to rest
-        s = planned.begins_m + state.plan_fit.curve.nearest(p_BCrater, state.s_torch)
-        if math.isnan(self._from_m):
-            self._from_m = s
+        s = state.plan_fit.curve.nearest(p_BCrater, state.s_torch)
+        if math.isnan(self._from_m) or (lit and not self._lit and s > self._to_m + APART_M):
+            self._from_m, self._begun = s, datetime.now(UTC).isoformat(timespec="milliseconds")
         if lit and s > self._to_m:
             self._to_m = s
             self._progress = replace(self._progress, p_BCrater=p_BCrater)
@@ -138,6 +139,8 @@ class ProgressKeeper:
         later = (*order[order.index(command.seam) + 1 :], len(order))
         seam, piece = (command.seam, command.piece + 1) if planned.more else (later[0], 0)
         done = seam >= len(order)
+        if command.weld_pass + 1 < run.cell.job.passes and not planned.more:
+            seam, piece, done = command.seam, command.piece, False
         self._progress = replace(found, seam=seam, piece=piece, done=done, p_BCrater=None, p_BBegin=None, felt=None)
         self._put(None)
 
@@ -145,14 +148,17 @@ class ProgressKeeper:
         return Stretch(
             seam=run.command.seam,
             piece=run.command.piece,
-            run=len(self._progress.folders) - 1,
-            from_m=self._from_m,
-            to_m=max(self._to_m, self._from_m),
+            weld_pass=run.command.weld_pass,
+            run=len(self._progress.ends) - 1,
+            from_m=float(self._line_on.place(self._from_m)),
+            to_m=float(self._line_on.place(max(self._to_m, self._from_m))),
             done=done,
+            begun=self._begun,
             time=datetime.now(UTC).isoformat(timespec="milliseconds"),
         )
 
     def _put(self, state: WeldingState | None) -> None:
+        self._state = state
         with self._changed:
             self._slot = self._progress, state
             self._changed.notify_all()
@@ -163,11 +169,15 @@ class ProgressKeeper:
         Raises:
             OSError: the disk took no progress.
         """
+        if run is not None:
+            self._progress = replace(self._progress, ends=(*self._progress.ends[:-1], run.reason or "done"))
         if not self._threads:
             return
         if run is not None and run.interrupted is not None and self._lit:
             self._at = -math.inf
             self.look(run)
+        if run is not None:
+            self._put(self._state)
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -193,7 +203,6 @@ class ProgressKeeper:
             self._problem = problem
 
     def _write(self) -> None:
-        marked = False
         try:
             for name, data in self._files.items():
                 write_apart(self._folder / RESTART / name, data)
@@ -208,18 +217,8 @@ class ProgressKeeper:
                 if state is not None:
                     progress = replace(progress, felt=felt_points(state))
                 progress.write(self._folder)
-                if state is not None and not marked:
-                    self._mark_earlier()
-                    marked = True
         except Exception as problem:  # the run must not end by it: the arc burns
             self._problem = problem
-
-    def _mark_earlier(self) -> None:
-        """Note in the earlier run's progress that its weld has gone on here."""
-        folders = self._progress.folders
-        if len(folders) > 1:
-            earlier = Path(folders[-2])
-            replace(load_progress(earlier), continued_in=folders[-1]).write(earlier)
 
 
 def felt_points(state: WeldingState) -> Array | None:

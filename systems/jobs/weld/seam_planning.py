@@ -34,11 +34,12 @@ from weldcal.welding.locate.planning import (
 from weldcal.welding.passes.angles import AnglesAlong, angles_along, lifted
 from weldcal.welding.passes.felt import PassError, WeldPass, felt_line, pass_config, pass_line
 from weldcal.welding.passes.stitch import StitchConfig, StitchError
+from weldcal.welding.passes.tacks import TackError
 from weldcal.welding.record.schedule import GapAlong, WeldSchedule, gap_along
 from weldcal.welding.seam.clearance import NoClearance, check_beside, check_clearance, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.restart import SPARE_M, Restart
+from weldcal.welding.seam.restart import SPARE_M, NoRoomBehindCrater, Restart
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel
@@ -181,7 +182,8 @@ def plan_pass(planning: SeamPlanning, root: PlannedSeam, number: int, state: Wel
     if felt is None:
         assert state is not None
         felt = felt_line(state, TIP_AHEAD * planning.tool.chord_m)
-    record = SeamRecord(root.records[-1].seam, weld_pass=number)
+    last, order = root.records[-1], planning.passes[number - 1]
+    record = SeamRecord(seam=last.seam, weld_pass=number, begins_m=root.begins_m, reverse=order.reverse)
     plan = dc.replace(root, weld_pass=number, felt_line=felt, records=(*root.records, record))
     try:
         seam, way, along = planning.pass_way(felt, number, root.X_BP)
@@ -222,7 +224,7 @@ def plan_seam(
         )
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
-    record, more = SeamRecord(planning.number), False
+    record, more = SeamRecord(seam=planning.number), False
     kept = (*views, ScanView(scan, X_BC)) if planning.keeps_scan else ()
     try:
         found = plan_root_anyhow(
@@ -233,7 +235,7 @@ def plan_seam(
             eyes if views else eyes[0],
             planning.arm.up,
         )
-        record = SeamRecord(planning.number, found.fit_up)
+        record = SeamRecord(seam=planning.number, fit_up=found.fit_up)
         if found.fit_up is not None and isinstance(planning.workpiece, Part):
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = whole = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
@@ -264,7 +266,7 @@ def plan_seam(
         return dc.replace(
             plan,
             felt=felt,
-            records=(*planning.earlier, dc.replace(record, line=plan.seam)),
+            records=(*planning.earlier, dc.replace(record, line=plan.seam, begins_m=again["begins_m"])),
             more=more,
             touch_arc_m=arc,
             part_sigma_m=found.sigma_m,
@@ -384,7 +386,11 @@ def gone_on(
     if cut.down_m is None:
         return planning, seam, arc, again
     again["felt_before"] = restart.felt
-    return dc.replace(planning, config=leaning(planning.config, 0.0, cut.down_m)), cut.line, cut.down_m, again
+    try:
+        config = leaning(planning.config, 0.0, cut.down_m, begins_m=cut.start_m)
+    except TackError as problem:
+        raise NoRoomBehindCrater(f"The rest cannot be felt: weld it by hand. {problem}") from problem
+    return dc.replace(planning, config=config), cut.line, cut.down_m, again
 
 
 def added_variance(
@@ -458,7 +464,7 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
         **way.reached,
         along=along,
         felt_line=None if seam is drawn else drawn,
-        records=(*planning.earlier, SeamRecord(planning.number, line=seam)),
+        records=(*planning.earlier, SeamRecord(seam=planning.number, line=seam)),
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -466,12 +472,14 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
-    records = (*planning.earlier, SeamRecord(planning.number))
+    records = (*planning.earlier, SeamRecord(seam=planning.number))
     try:
         whole = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         planning, seam, arc, again = gone_on(planning, whole, whole, planning.X_BP_guess, math.nan, None)
+        plan = _planned(planning, sequence, seam, planning.X_BP_guess)
         return dc.replace(
-            _planned(planning, sequence, seam, planning.X_BP_guess),
+            plan,
+            records=(*planning.earlier, dc.replace(plan.records[-1], begins_m=again["begins_m"])),
             touch_arc_m=arc,
             **again,
             rms_m=0.0,

@@ -141,7 +141,7 @@ class WeldingVelocityServo(LeafSystem):
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else start_state(planned.felt_before)
         config = self._configs[min(job.seam, len(self._configs) - 1)][planned.weld_pass]
-        config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
+        config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m, planned.begins_m)
         if planned.felt_before is not None:  # the arc begins where it is ordered, however late the power source is
             config = dc.replace(config, torch=dc.replace(config.torch, from_rest=True))
         if planned.along is not None:

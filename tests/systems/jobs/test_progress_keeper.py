@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform
 
 from tests.systems.jobs.test_arm_way import planning
 from weldcal.systems.jobs.weld import progress_keeper
+from weldcal.systems.jobs.weld.arm_way import leaning
 from weldcal.systems.jobs.weld.progress_keeper import ProgressKeeper
 from weldcal.systems.jobs.weld.seam_planning import gone_on, stitch_piece
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
@@ -21,7 +22,7 @@ from weldcal.systems.messages import PlannedSeam, SeamRecord
 from weldcal.welding.record.progress import PROGRESS_NAME, Progress, load_progress
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
-from weldcal.welding.seam.restart import Restart
+from weldcal.welding.seam.restart import NoRoomBehindCrater, Restart
 from weldcal.welding.servo.state import WeldingState
 
 SEAM = SeamCurve.from_points(np.column_stack([np.linspace(0.0, 0.2, 41), np.zeros(41), np.zeros(41)]))
@@ -32,12 +33,38 @@ STITCHES = "welding: {stitch: {on_mm: 40, off_mm: 40, order: middle_out}}"  # 80
 def test_only_the_broken_stitch_begins_before_its_crater(piece: int, begins_mm: float, ends_mm: float) -> None:
     restart = Restart(seam=0, piece=1, p_BCrater=np.array([0.025, 1e-4, 0.0]), p_BBegin=np.array([0.0005, 0.0, 0.0]))
     order = replace(planning(STITCHES), piece=piece, restart=restart)
-    order, line, _, _ = stitch_piece(order, SEAM, SeamRecord(0))
+    order, line, _, _ = stitch_piece(order, SEAM, SeamRecord(seam=0))
     order, line, down_m, again = gone_on(order, line, SEAM, None, 0.0, None)
     assert 1e3 * again["begins_m"] == pytest.approx(begins_mm, abs=0.01)
     assert 1e3 * line.position(line.length)[0] == pytest.approx(ends_mm, abs=0.01)
     assert 1e3 * line.position(0.0)[0] == pytest.approx(begins_mm, abs=0.01)
     assert ("question" in again, down_m is not None) == (piece == 1, piece == 1)
+
+
+TACKS = "welding: {{tacks: [{{from_mm: 20, to_mm: 26, height_mm: 5.5}}, {{from_mm: {0}, to_mm: {1}, height_mm: 5.5}}]}}"
+
+
+def test_a_tack_stays_where_it_is_when_the_weld_goes_on() -> None:
+    crater = Restart(seam=0, p_BCrater=np.array([0.025, 1e-4, 0.0]), p_BBegin=np.array([0.0005, 0.0, 0.0]))
+    order, _, down_m, again = gone_on(
+        replace(planning(TACKS.format(150, 160)), restart=crater), SEAM, SEAM, None, 0.0, None
+    )
+    assert again["begins_m"] == pytest.approx(0.017, abs=1e-5)
+    assert down_m is not None
+    (tack,) = order.config.tacks
+    assert (tack.start, tack.end) == pytest.approx((0.133, 0.143), abs=1e-5), "the first one lies behind the tip"
+    begun = leaning(planning(TACKS.format(150, 160)).config, 0.0, down_m, begins_m=again["begins_m"])
+    assert begun.tacks == order.config.tacks, "the servo lifts the tip where it was planned"
+    with pytest.raises(NoRoomBehindCrater, match="weld it by hand"):
+        gone_on(replace(planning(TACKS.format(62, 70)), restart=crater), SEAM, SEAM, None, 0.0, None)
+
+
+def test_the_crater_stays_where_the_first_run_located_it() -> None:
+    """A new scan places the seam's start 2 mm further back."""
+    again = replace(planning(), restart=Restart(seam=0, p_BCrater=np.array([0.1, 0.0, 0.0]), crater_m=0.098))
+    _, _, _, found = gone_on(again, SEAM, SEAM, None, 0.0, None)
+    assert found["begins_m"] == pytest.approx(0.090, abs=1e-5)
+    assert "8 mm before the crater at 98 mm" in found["question"]
 
 
 class Weld:
@@ -63,12 +90,11 @@ class Weld:
             command=lambda _: SimpleNamespace(phase=phase),
             servo_report=lambda _: report,
             planned_seam=lambda _: planned,
-            calibration_status=lambda _: SimpleNamespace(X_BC=None),
             travel=SimpleNamespace(order=(1, 0)),
+            passes=1,
         )
-        scenario = SimpleNamespace(job=SimpleNamespace(X_BC=None))
-        cell = SimpleNamespace(job=job, scenario=scenario, station=None)
-        command = SimpleNamespace(seam=seam, piece=piece)
+        cell = SimpleNamespace(job=job, scenario=None, station=None)
+        command = SimpleNamespace(seam=seam, piece=piece, weld_pass=0)
         run = SimpleNamespace(cell=cell, root=None, command=command, seconds=self.seconds, interrupted=None)
         self.keeper.look(cast(Any, run))
 
@@ -80,7 +106,7 @@ class Weld:
 @pytest.fixture
 def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Weld:
     monkeypatch.setattr(progress_keeper, "seam_tool", lambda *_: SimpleNamespace(p_TW=np.zeros(3)))
-    made = Progress(scenario="", seed=0, robot=None, scenario_sha256="", folders=(str(tmp_path),), seam=1)
+    made = Progress(scenario="", seed=0, robot=None, scenario_sha256="", ends=("",), seam=1)
     return Weld(tmp_path, made)
 
 

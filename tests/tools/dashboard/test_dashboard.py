@@ -318,6 +318,19 @@ def test_the_time_left_follows_the_pace_that_was_asked_for(source: DashboardSour
     assert source.values()["left_s"] == 120
 
 
+def test_the_time_left_is_that_of_the_wall_clock(source: DashboardSource, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulation that takes four seconds for each of its own has four times as much left; a hold counts as none."""
+    welding(source.live)
+    assert source.values()["left_s"] == 12
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 4.0 * source.live.moment.time)
+    assert source.values()["left_s"] == pytest.approx(48, abs=1)
+    source.operator.stands = True
+    monkeypatch.setattr(time, "monotonic", lambda: now + 9.0 * source.live.moment.time)
+    assert source.values()["left_s"] == pytest.approx(48, abs=1)
+    assert source.values()["wall_s"] == pytest.approx(4.0 * source.live.moment.time, abs=1.0)
+
+
 def test_a_page_that_hears_nothing_says_so(browser: Browser, page: Dashboard, source: DashboardSource) -> None:
     calibrating(source.live)
     opened(browser, page.url, "RUNNING")

@@ -4,7 +4,8 @@ drawn."""
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,7 +15,25 @@ from pydrake.math import RigidTransform
 from tests.welding.locate.lying import box as solid_box
 from tests.welding.locate.lying import triangles
 from weldcal.models.mesh import TriMesh
-from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, broken, part_in_scan, paths, zero_crossings
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
+from weldcal.systems.messages import SeamRecord
+from weldcal.systems.runner import ProcessTime
+from weldcal.systems.station import Truth
+from weldcal.tools.report.plots_weld import (
+    WeldTrace,
+    along_the_weld,
+    broken,
+    part_in_scan,
+    paths,
+    weld_traces,
+    zero_crossings,
+)
+from weldcal.tools.report.weld import WeldLog, WeldOutcome
+from weldcal.tools.report.weld_record import burned_arcs, places
+from weldcal.welding.passes.felt import WeldPass
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 N = 120
 S = np.linspace(-0.06, 0.2, N)
@@ -120,3 +139,87 @@ def test_several_seams_are_lines_of_their_own() -> None:
     assert np.isfinite(one.s).all()
     assert paths(both)
     assert along_the_weld(both)
+
+
+TICK_S = 0.008
+
+
+def two_passes() -> tuple[WeldLog, tuple[SeamRecord, SeamRecord]]:
+    """A seam of 60 mm at 8 mm/s, held in its middle, and a pass back from its end 20 s later; planned from 5 mm on."""
+    ahead = SeamCurve.from_points(np.column_stack([np.linspace(0.0, 0.06, 61), np.zeros(61), np.zeros(61)]))
+    back = SeamCurve.from_points(np.column_stack([np.linspace(0.06, 0.0, 61), np.zeros(61), np.full(61, 0.003)]))
+    codes, s, on = [], [], []
+    for held in (True, False):
+        places = np.arange(0.0, 0.06, 0.008 * TICK_S)
+        codes += [PHASE_CODES[Phase.TOUCH]] * 10 + [PHASE_CODES[Phase.TRACK]] * len(places)
+        s += [np.nan] * 10 + places.tolist()
+        on += [False] * 10 + [not (held and 0.02 < at < 0.03) for at in places]
+    n = len(s) // 2
+    time = TICK_S * np.arange(2 * n) + np.where(np.arange(2 * n) < n, 0.0, 20.0)
+    x = np.nan_to_num(np.where(np.arange(2 * n) < n, s, 0.06 - np.array(s)))
+    p_BW = np.column_stack([x, 0.0 * x, np.where(np.arange(2 * n) < n, 0.0, 0.003)])
+    names = ("delta_n", "delta_axial", "omega", "n_d_dot_n_t", "e_t", "s_tip")
+    log = WeldLog(
+        time=time,
+        telemetry={"phase": np.array(codes), "s_torch": np.array(s)} | dict.fromkeys(names, 0.001 + 0.0 * x),
+        torch_on=np.array(on),
+        p_BTip=p_BW,
+        p_BRobot=p_BW,
+        R_BT=np.broadcast_to(np.eye(3), (2 * n, 3, 3)),
+        p_BW=p_BW,
+        p_BTorch=p_BW,
+        work=0.0 * x,
+        travel=0.0 * x,
+        deflection_T=p_BW,
+        sigma_min=0.0 * x,
+    )
+    return log, (
+        SeamRecord(seam=0, line=ahead, begins_m=0.005),
+        SeamRecord(seam=0, weld_pass=1, line=back, begins_m=0.005, reverse=True),
+    )
+
+
+def test_places_are_those_of_the_whole_seam() -> None:
+    log, records = two_passes()
+    s, left, up = places(log, records, log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH])
+    moving = np.isfinite(s)
+    assert moving.sum() == len(s) - 20
+    assert s[moving] == pytest.approx(0.005 + log.p_BW[moving, 0], abs=1e-6)
+    assert np.abs(np.concatenate([left[moving], up[moving]])).max() < 1e-6
+
+
+def test_each_arc_of_the_log_says_how_it_ended() -> None:
+    log, _ = two_passes()
+    lit = log.time[np.flatnonzero(np.diff(log.torch_on.astype(int)) > 0) + 1]
+    arcs = [ProcessTime(on_s=at + 0.016, start=f"a{k}", end=f"b{k}") for k, at in enumerate(lit)]
+    arcs[0].held_by = "the terminal"
+    run: Any = SimpleNamespace(arcs=arcs, phases=[("weld", 0.0, 0.0)], held=True, reason="It was stopped.")
+    ended = [(arc["start"], arc["ended"]) for arc in burned_arcs(run, log, 2)]
+    assert ended == [("a0", "held by an operator (the terminal)"), ("a1", "done"), ("a2", "It was stopped.")]
+    run.phases = [("weld", 0.0, 0.0), ("retract", 1.0, 1.0), ("held", 2.0, 2.0)]
+    assert burned_arcs(run, log, 2)[-1] == {"run": 2, "start": "a2", "end": "b2", "ended": "done"}
+
+
+def test_each_pass_has_its_own_picture_without_lines_where_the_arc_was_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    log, records = two_passes()
+    weld = WeldOutcome(log=log, true_seam=None, planned=None, error=None, plan_error=None)
+    job = SimpleNamespace(planned_seam=lambda _: SimpleNamespace(records=records), servo_config=ServoConfig())
+    welding = SimpleNamespace(later_passes=lambda: (WeldPass(vertical_m=0.003, reverse=True),))
+    nothing = SimpleNamespace(truth=Truth(X_BC=None, X_BP=None, workpiece=None))
+    cell: Any = SimpleNamespace(job=job, station=nothing, scenario=SimpleNamespace(welding=welding))
+    traces = weld_traces(weld, cell, cast(Any, None))
+    assert list(traces) == ["1", "1_pass_2"]
+    for one in traces.values():
+        assert (np.nanmin(one.s), np.nanmax(one.s)) == pytest.approx((0.005, 0.065), abs=1e-4)
+        assert paths(one)
+        assert along_the_weld(one)
+    drawn: list[Any] = []
+    plot = Axes.plot
+    monkeypatch.setattr(
+        Axes, "plot", lambda axes, *data, **more: (drawn.append((data, more)), plot(axes, *data, **more))[1]
+    )
+    paths(traces["1"])
+    torch = next(data for data, more in drawn if more.get("label") == "torch, arc on")
+    gap = np.isnan(torch[1])  # over x of the base, as the pictures are drawn
+    assert gap[1:-1].any(), "a line has a gap where the arc was off"
+    assert np.nanmax(np.abs(np.diff(torch[1]))) < 1.0, "mm: none goes from seam to seam"

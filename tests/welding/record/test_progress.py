@@ -13,7 +13,7 @@ import pytest
 from weldcal.welding.record.progress import CRATERS_NAME, PROGRESS_NAME, Progress, ProgressError, Stretch, load_progress
 from weldcal.welding.record.weld_log import WeldRecord
 
-BEGUN = Progress(scenario="mine", seed=3, robot=None, scenario_sha256="abc", folders=("/a", "/b"))
+BEGUN = Progress(scenario="mine", seed=3, robot=None, scenario_sha256="abc", ends=("killed", ""))
 
 
 LINES: tuple[tuple[float, dict[str, object]], ...] = (
@@ -40,7 +40,7 @@ def test_the_progress_comes_back_from_its_file(tmp_path: Path) -> None:
     made.write(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [PROGRESS_NAME]
     found = load_progress(tmp_path)
-    assert (found.scenario, found.seed, found.robot, found.folders) == ("mine", 3, None, ("/a", "/b"))
+    assert (found.scenario, found.seed, found.robot, found.ends) == ("mine", 3, None, ("killed", ""))
     assert found.stretches == made.stretches
     assert found.felt == pytest.approx(felt, abs=1e-9)
     assert found.X_BP is None
@@ -78,7 +78,7 @@ def test_a_stretch_grows_until_its_seam_ends() -> None:
     assert [(one.seam, one.to_m, one.done) for one in ended.stretches] == [(1, 0.2, True), (2, 0.01, False)]
 
 
-@pytest.mark.parametrize("change", [{"schema": "other"}, {"version": 2}, {"felt": [[1.0]]}, {"seed": "x"}])
+@pytest.mark.parametrize("change", [{"schema": "other"}, {"version": 1}, {"felt": [[1.0]]}, {"seed": "x"}])
 def test_a_damaged_progress_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     BEGUN.write(tmp_path)
     path = tmp_path / PROGRESS_NAME

@@ -245,7 +245,7 @@ function update(v) {
   for (const name of ["hold", "go_on", "end"]) if (el(name)) el(name).disabled = !v.can[name];
   if (!v.can.end) unsure();
   el("bar").style.width = (100 * v.share).toFixed(1) + "%";
-  say("clock", v.time_s > 0 ? duration(v.time_s) + (v.can.end ? " so far" : "") : "");
+  say("clock", v.wall_s > 0 ? duration(v.wall_s) + (v.can.end ? " so far" : "") : "");
   say("left", v.left_s === null ? "" : "about " + duration(v.left_s) + " left");
   el("steps").replaceChildren(...v.steps.map(s => {
     const li = document.createElement("li");

@@ -13,6 +13,7 @@ from weldcal.tools.worlds.weld.plant import PHASES, StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
+from weldcal.welding.record.welded_seam import evenness
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchOnConfig
@@ -248,7 +249,7 @@ def figures(result: DemoResult, name: str, law: str, seed: int) -> CellRun:
     """Return the figures of a finished run, in mm."""
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
-    if weld is None or weld.error is None or weld.speed is None or felt is None:
+    if weld is None or weld.error is None or felt is None or result.record is None:
         return CellRun(scenario=name, law=law, seed=seed, completed=False, reason=run.reason or "nothing was welded")
     return CellRun(
         scenario=name,
@@ -263,7 +264,7 @@ def figures(result: DemoResult, name: str, law: str, seed: int) -> CellRun:
         torch_mean_mm=1e3 * weld.error.mean_m,
         torch_max_mm=1e3 * weld.error.max_m,
         space_max_mm=1e3 * float(np.hypot(weld.error.lateral, weld.error.height).max()),
-        cv_percent=1e2 * weld.speed.cv,
+        cv_percent=1e2 * evenness(result.record.log),
         real_time_factor=run.real_time_factor("weld"),
     )
 
