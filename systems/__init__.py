@@ -94,7 +94,7 @@ if TYPE_CHECKING:
     from weldcal.systems.runner import Run as Run, run_cell as run_cell
     from weldcal.systems.scenario.loading import load_scenario as load_scenario
     from weldcal.systems.scenario.schema import Scenario as Scenario
-    from weldcal.systems.station import Station as Station, Truth as Truth
+    from weldcal.systems.station import Station as Station
     from weldcal.systems.wiring import Replacement as Replacement, Wiring as Wiring
 else:
     from weldcal.models import exported
