@@ -173,7 +173,9 @@ def require_guard() -> None:
     guarded = file is None or package  # neither a notebook nor a package's own __main__ is imported
     if not guarded:
         try:
-            tests = [node.test for node in ast.walk(ast.parse(Path(file).read_bytes())) if isinstance(node, ast.If)]
+            tests = [
+                node.test for node in ast.walk(ast.parse(Path(str(file)).read_bytes())) if isinstance(node, ast.If)
+            ]
         except (OSError, SyntaxError, ValueError):  # a program in an archive
             return
         guarded = any(getattr(node, "id", "") == "__name__" for test in tests for node in ast.walk(test))

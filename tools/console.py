@@ -250,8 +250,8 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 def progress_bar(title: str) -> Iterator[Progress]:
     """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter.
 
-    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is. What a stage
-    says after a line break is printed on lines of its own, above the bar.
+    The completed fraction never falls: a stage that reports less than an earlier one leaves it where it is. The text of
+    a stage after a line break is printed on lines of its own, above the bar.
     """
     reached = 0.0
 

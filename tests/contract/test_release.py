@@ -42,8 +42,7 @@ def tree(path: str) -> Any:
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    newest = SECTION.search(read("CHANGELOG.md"))
-    assert newest is not None
+    newest = next(found for found in SECTION.finditer(read("CHANGELOG.md")) if found["version"] != "Unreleased")
     assert newest["version"] == tree("CITATION.cff")["version"] == PROJECT["version"]
     assert newest["date"] == tree("CITATION.cff")["date-released"]
     assert date.fromisoformat(newest["date"])

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from tests.contract.test_imports import FILES
 from tests.documents.props import needs_data
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, require_data
 from tests.ways_on import Ran, Walk, copied, offered, results
 from weldcal.tools.cli.app import app
 
@@ -53,8 +53,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
 
 @pytest.mark.parametrize("words", ONE_OF_EACH)
 def test_every_printed_way_on_leads_on(walk: Walk, words: str) -> None:
-    if needs_data(words) and not SHARED_DATA.exists():
-        pytest.skip("the measured data (shared/data beside the checkout) are not here")
+    if needs_data(words):
+        require_data(SHARED_DATA)
     assert [f"{way.printed}: {way.wrong}" for way in walk.result(words) if way.wrong] == []
 
 

@@ -16,7 +16,7 @@ import pytest
 import typer
 
 from tests.documents.props import lay_out, needs_data
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, require_data
 from tests.terminal import COLUMNS, Shown, remaining, run_in_terminal
 from tests.tools.report.small_outcomes import PAGES, Made, calibration
 from weldcal.tools.cli import options
@@ -92,7 +92,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
 def of(shown: dict[str, Shown], line: str) -> Shown:
     """What a command line left; the test is skipped where measured data are not here."""
     if line not in shown:
-        pytest.skip("the measured data (shared/data beside the checkout) are not here")
+        require_data(SHARED_DATA)
     return shown[line]
 
 

@@ -242,7 +242,7 @@ def weldable_places(
                 break
 
         def welded(refused: dict[int, tuple[float, str]]) -> float:
-            return sum(seams[k].arc_length_m[-1] for k in left if k not in refused)
+            return float(sum(seams[k].arc_length_m[-1] for k in left if k not in refused))
 
         left, why = set(range(len(seams))), dict[int, str]()
         nearest = max(
