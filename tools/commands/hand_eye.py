@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
-from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, wrong_scale
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
@@ -444,10 +444,9 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    scale = scale_warning(problem, result)
-    return replace(
-        result, warnings=(*result.warnings, *explain_outliers(pairs, result), *([] if scale is None else [scale]))
-    )
+    scale = wrong_scale(problem, result, config)
+    said = [] if scale is None else [scale.sentence]
+    return replace(result, scale=scale, warnings=(*result.warnings, *explain_outliers(pairs, result), *said))
 
 
 def solve_arrays(
