@@ -32,6 +32,8 @@ _NAMES = {
     "model": ("model", ""),
     "model_reason": ("why this model", ""),
     "method": ("method", ""),
+    "z_grows": ("z of the profiles grows", ""),
+    "z_reason": ("by the profiles", ""),
     "rms_mm": ("residual, rms", "mm"),
     "reduced_chi2": ("reduced chi-square, 1 where the stated sigmas are right", ""),
     "condition": ("condition of the scans, 1 at best", ""),
