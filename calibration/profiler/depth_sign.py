@@ -75,7 +75,7 @@ def choose_sign(fits: Mapping[str, SignFit], total: int, what: str, alike: Calla
         WeldcalError: the error of the sign that shows more, where no result explains the profiles.
         InconsistentData: both signs explain the profiles, and the results differ.
     """
-    order = sorted(fits, key=lambda grows: (-fits[grows].kept, fits[grows].variance, -fits[grows].shown))
+    order = sorted(fits, key=lambda g: (-fits[g].kept, fits[g].variance if fits[g].kept else -fits[g].shown))
     counts = " and ".join(
         f"with z {WORDS[g]} {fits[g].shown} of {total} profiles show the {what}"
         + (f" and {fits[g].kept} agree" if fits[g].shown else "")

@@ -285,6 +285,7 @@ def run_hand_eye(
             raise InputError("Motions (--motions) belong to ax-xb.")
         result = solve_ax_xb(pairs.robot, pairs.camera, config)
         problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
+        result = _with_scale(problem, result, config)
     else:
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
@@ -306,7 +307,13 @@ def run_hand_eye(
         refined = _refined(pairs, config, said, optional=optional)
         if refined is not None and refined.accepted:
             adopted = True
-            result = replace(refined.result, labels=found.labels, equation=found.equation, warnings=result.warnings)
+            result = replace(
+                refined.result,
+                labels=found.labels,
+                equation=found.equation,
+                warnings=result.warnings,
+                scale=result.scale,
+            )
             pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
             problem = problem_of_pairs(pairs)
     if refine is not None and arm is not None:
@@ -444,9 +451,14 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs)
     if mistake is not None:
         raise InconsistentPoses(mistake)
+    explained = replace(result, warnings=(*result.warnings, *explain_outliers(pairs, result)))
+    return _with_scale(problem, explained, config)
+
+
+def _with_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig) -> HandEyeResult:
+    """Return the result with what the robot's motion says of the camera's scale."""
     scale = wrong_scale(problem, result, config)
-    said = [] if scale is None else [scale.sentence]
-    return replace(result, scale=scale, warnings=(*result.warnings, *explain_outliers(pairs, result), *said))
+    return result if scale is None else replace(result, scale=scale, warnings=(*result.warnings, scale.sentence))
 
 
 def solve_arrays(
