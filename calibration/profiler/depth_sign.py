@@ -89,9 +89,9 @@ def choose_sign(fits: Mapping[str, SignFit], total: int, what: str, alike: Calla
     chosen = order[0]
     if len(order) > 1:
         second = fits[order[1]]
-        if _beats(first, second, CHANCE[0]):
+        if beats(first, second):
             pass
-        elif _beats(second, first, CHANCE[1]) or (second.kept and alike() and second.variance < first.variance):
+        elif beats(second, first, CHANCE[1]) or (second.kept and alike() and second.variance < first.variance):
             chosen = order[1]
         elif not (second.kept and alike()):
             raise InconsistentData(
@@ -101,7 +101,7 @@ def choose_sign(fits: Mapping[str, SignFit], total: int, what: str, alike: Calla
     return chosen, f"z of the profiles grows {WORDS[chosen]}: {counts}."
 
 
-def _beats(one: SignFit, other: SignFit, chance: float) -> bool:
+def beats(one: SignFit, other: SignFit, chance: float = CHANCE[0]) -> bool:
     """Test whether twice as many profiles agree with one sign, or its residuals are smaller than by chance."""
     if not one.kept or 2 * one.kept < other.shown:
         return False

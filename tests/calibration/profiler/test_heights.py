@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,17 @@ def test_a_stated_sign_is_used(tmp_path: Path) -> None:
         "--z away or --z towards, not 'up'"
         in _called("edge", files, "--feature", "apex", "--z", "up", "--out", tmp_path / "o")[1]
     )
+
+
+@pytest.mark.parametrize("heights", [False, True])
+def test_a_step_with_the_wrong_side_is_asked_about(heights: bool, tmp_path: Path) -> None:
+    made = profile_set(np.random.default_rng([5, int(heights)]), "step", heights, views=20)
+    other = {"left": "right", "right": "left"}[made.side]
+    verdict, said = tried(replace(made, side=other), tmp_path / "wrong")
+    sign = "towards" if heights else "away"
+    assert verdict == "refused"
+    assert f"--side {made.side} --z {sign}" in said
+    assert tried(made, tmp_path / "right", "--z", sign)[0] in ("right", "wide")
 
 
 def test_a_seam_of_the_other_sign_than_its_calibration_is_refused(tmp_path: Path) -> None:
