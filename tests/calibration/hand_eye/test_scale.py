@@ -17,6 +17,10 @@ def test_a_board_at_97_percent_is_named(n: int) -> None:
     found = named(F, G)
     assert found is not None
     assert found.factor == pytest.approx(0.97, abs=max(4.0 * found.sigma, 1e-3))
+    first = _scale_fit(full_problem(F, G), solve_problem(full_problem(F, G), config=QUICK))
+    assert first is not None
+    assert first[1] == pytest.approx(found.sigma, rel=0.3)  # the residuals with the error in them are 20 times as large
+    assert first[2] < 1e-5
     plain = solve_problem(full_problem(F, G), config=QUICK).X.translation() - X[:3, 3]
     assert np.linalg.norm(found.poses["X"].translation() - X[:3, 3]) < 0.5 * np.linalg.norm(plain)
     assert "too long" in found.sentence
