@@ -186,6 +186,7 @@ def profiler_report(made: ProfilerFile) -> str:
             if judged
             else None
         ),
+        of="scans",
         seen=_seen(made.points),
         seam=None,
         rows=_rows(made.found),
@@ -204,6 +205,7 @@ def seam_report(seam: ProfilerSeam) -> str:
         title=f"Seam mapped from {seam.source}",
         subtitle=f"In the robot's base, by the calibration {seam.calibration}.",
         bars=None,
+        of="scans",
         seen=None,
         seam=_line(seam.root_mm),
         rows=_rows(seam.found),

@@ -198,6 +198,7 @@ def tool_tcp(
             if np.isfinite(held).any()
             else None
         ),
+        of="touches",
         seen=None,
         seam=None,
         rows=list(report.rows().items()),
