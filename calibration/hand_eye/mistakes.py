@@ -225,6 +225,12 @@ def wrong_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig |
     return CameraScale(factor=factor, sigma=rest[1], chance=rest[2], poses=again.poses)
 
 
+def with_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig) -> HandEyeResult:
+    """Return the result with what the robot's motion says of the camera's scale."""
+    scale = wrong_scale(problem, result, config)
+    return result if scale is None else replace(result, scale=scale, warnings=(*result.warnings, scale.sentence))
+
+
 def _scale_fit(problem: Problem, result: HandEyeResult, applied: float = 0.0) -> tuple[float, float, float] | None:
     """Find the change of scale that the residuals ask for, its sigma, and the chance of the whole change.
 

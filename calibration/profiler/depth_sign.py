@@ -1,4 +1,4 @@
-"""Find which way z grows in profiles: away from the sensor, or towards it as in heights (Gocator, Keyence LJ)."""
+"""Find where z grows in profiles: away from the sensor, or towards it as in heights (Gocator, Keyence LJ)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -95,8 +95,8 @@ def choose_sign(fits: Mapping[str, SignFit], total: int, what: str, alike: Calla
             chosen = order[1]
         elif not (second.kept and alike()):
             raise InconsistentData(
-                f"The profiles do not show which way z grows: {counts}, and the results differ. State it with --z"
-                " away or --z towards; heights (Gocator, Keyence) grow towards the sensor."
+                f"The profiles do not show where z grows: {counts}. The results differ. State it with --z away or"
+                " --z towards; heights (Gocator, Keyence) grow towards the sensor."
             )
     return chosen, f"z of the profiles grows {WORDS[chosen]}: {counts}."
 

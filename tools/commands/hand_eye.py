@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
-from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, wrong_scale
+from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, with_scale
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
@@ -285,7 +285,7 @@ def run_hand_eye(
             raise InputError("Motions (--motions) belong to ax-xb.")
         result = solve_ax_xb(pairs.robot, pairs.camera, config)
         problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
-        result = _with_scale(problem, result, config)
+        result = with_scale(problem, result, config)
     else:
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
@@ -452,13 +452,7 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     if mistake is not None:
         raise InconsistentPoses(mistake)
     explained = replace(result, warnings=(*result.warnings, *explain_outliers(pairs, result)))
-    return _with_scale(problem, explained, config)
-
-
-def _with_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig) -> HandEyeResult:
-    """Return the result with what the robot's motion says of the camera's scale."""
-    scale = wrong_scale(problem, result, config)
-    return result if scale is None else replace(result, scale=scale, warnings=(*result.warnings, scale.sentence))
+    return with_scale(problem, explained, config)
 
 
 def solve_arrays(

@@ -179,10 +179,10 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
         twin, there = _tried(file, sigmas, feature, other_side, opposite)
         if there.kept and not beats(fits[grows], there) and not _alike([tried[grows][0].fit, twin.fit]):
             raise InconsistentData(
-                f"The profiles do not show which face of the {feature} is near: {fits[grows].kept} of {total} agree on"
-                f" one edge with the near face on the {side} and z {WORDS[grows]}, {there.kept} with it on the"
-                f" {other_side} and z {WORDS[opposite]}, and the results differ. State z: --side {side} --z {grows}, or"
-                f" --side {other_side} --z {opposite}; heights (Gocator, Keyence) grow towards the sensor."
+                f"The profiles do not show which face of the {feature} is near. With the near face on the {side} and z"
+                f" {WORDS[grows]}, {fits[grows].kept} of {total} agree on one edge. With it on the {other_side} and z"
+                f" {WORDS[opposite]}, {there.kept} agree on another. State z: --side {side} --z {grows}, or"
+                f" --side {other_side} --z {opposite}. Heights (Gocator, Keyence) grow towards the sensor."
             )
     return replace(tried[grows][0], words={"z_grows": WORDS[grows], "z_reason": reason})
 
