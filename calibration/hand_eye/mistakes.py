@@ -10,23 +10,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
+from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose, scaled
 from weldcal.calibration.hand_eye.pairs.conventions import ReadingAgreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import LEAST_SCALE, SCALE_SIGMA, decided
-from weldcal.calibration.hand_eye.problem import Problem, full_problem, inverse_information, linearise, residuals
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, predicted, residuals
 from weldcal.calibration.hand_eye.repeats import one_per_pose
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.hand_eye.solve import CameraScale, HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
 _FEWEST = 5
 _COUNTS = {1: "one sample", 2: "two samples", 3: "three samples"}
-_STEP = 1e-4  # of the scale, for its derivative
 _FITS = 4.0  # sigma per axis: a row with this correction agrees with the others
 _MOST_ODD = 20  # excluded rows that are explained one by one
-_SURE = 6.0  # standard deviations at which a scale is off
-_LEAST_SCALE = 3e-3  # and by how much it must be, to be worth a sentence
+_LEVEL = 0.01  # at which a scale is no chance, as the shift of a principal point
+_LEAST_SCALE, _MOST_SCALE = 3e-3, 0.3  # choices: less is not worth a sentence, more is another mistake
+_VAGUE_SCALE = 0.05  # a choice: one sigma from which on the motion does not tell the scale
+_ROUNDS = 8  # of the two variances, which settle within four
+_OPEN = 1e-7  # of a column: what the others leave of it, below which it is theirs
 
 
 def likely_mistake(pairs: PosePairs) -> str | None:
@@ -198,34 +201,77 @@ def _listed(pairs: PosePairs, rows: Sequence[int]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}" if words[1:] else words[0]
 
 
-def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
-    """Warn where the robot's motion shows that all camera distances are too long or too short by one factor.
+def wrong_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig | None = None) -> CameraScale | None:
+    """Find the factor by which all camera distances are too long or too short; None where it may be chance.
 
-    Causes are a target of another size, or a wrong focal length. Such an error shifts the answer without showing in any
-    reprojection.
+    Causes are a target of another size, a wrong focal length, or the robot's unit. Such an error shifts the answer
+    without showing in any reprojection. The factor is one more unknown; its F test takes the variances that the fit
+    with this unknown leaves (level _LEVEL). A second fit with the factor applied gives the poses.
+    """
+    first = _scale_fit(problem, result)
+    if first is None or first[2] > _LEVEL:
+        return None
+    config = replace(config or HandEyeConfig(), folds=0)
+    try:
+        again = solve_problem(replace(problem, G=scaled(problem.G, 1.0 + first[0])), config=config)
+    except WeldcalError:
+        return None
+    rest = _scale_fit(replace(problem, G=scaled(problem.G, 1.0 + first[0])), again, first[0])
+    if rest is None or rest[2] > _LEVEL:
+        return None
+    factor = (1.0 + first[0]) * (1.0 + rest[0])
+    if not _LEAST_SCALE <= abs(factor - 1.0) < _MOST_SCALE:
+        return None
+    return CameraScale(factor=factor, sigma=rest[1], chance=rest[2], poses=again.poses)
+
+
+def with_scale(problem: Problem, result: HandEyeResult, config: HandEyeConfig) -> HandEyeResult:
+    """Return the result with what the robot's motion says of the camera's scale."""
+    scale = wrong_scale(problem, result, config)
+    return result if scale is None else replace(result, scale=scale, warnings=(*result.warnings, scale.sentence))
+
+
+def _scale_fit(problem: Problem, result: HandEyeResult, applied: float = 0.0) -> tuple[float, float, float] | None:
+    """Find the change of scale that the residuals ask for, its sigma, and the chance of the whole change.
+
+    Beside the poses and the scale, the positions may be turned against the rotations of the camera, as a wrong
+    principal point turns them: three more unknowns. ``applied``: change that the poses already have.
     """
     # repeats say nothing more about the scale than one sample does
     used = one_per_pose(problem).problem.pick(np.unique(result.observation[result.inliers]))
-    if problem.tied or not used.all_full or 6 * len(used) < problem.size + 12 or result.unobservable:
+    if not used.all_full or result.unobservable:
         return None
-    X, Y = (np.asarray(result.poses[k].GetAsMatrix4()) if k in result.poses else IDENTITY for k in "XY")
-    Z = np.asarray(result.poses["Z"].GetAsMatrix4()) if "Z" in result.poses else IDENTITY
-    state = X, Y, Z
+    X, Y, Z = (np.asarray(result.poses[k].GetAsMatrix4()) if k in result.poses else IDENTITY for k in "XYZ")
+    state = X, X if problem.tied else Y, Z
     lin = linearise(used, state, np.zeros(3))
-    _, up = residuals(replace(used, G=scaled(used.G, 1.0 + _STEP)), state)
-    column = (up - lin.d)[:, :, None] / _STEP
-    Jd = np.concatenate([lin.Jd, column], axis=2).reshape(-1, problem.size + 1)
-    Jw = np.concatenate([lin.Jw, np.zeros_like(column)], axis=2).reshape(-1, problem.size + 1)
-    w, d = lin.w.reshape(-1), lin.d.reshape(-1)
-    a, b = (max(float(e @ e) / (e.size - 0.5 * problem.size), 1e-30) for e in (w, d))
-    V = inverse_information(Jw.T @ Jw / a + Jd.T @ Jd / b)
-    s = -float(V[-1] @ (Jw.T @ w / a + Jd.T @ d / b))
-    sigma = float(np.sqrt(V[-1, -1]))
-    if abs(s) < max(_SURE * sigma, _LEAST_SCALE):
-        return None
-    # the positions fit when multiplied by 1 + s
-    return (
-        f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'}"
-        " for the robot's motion; check the size of the target and the camera's focal length: an error of either"
-        " shifts the result."
+    n, blank = 3 * len(used), np.zeros((3 * len(used), 3))
+    J = np.vstack(
+        [np.hstack([lin.Jw.reshape(n, -1), blank]), np.hstack([lin.Jd.reshape(n, -1), lin.Jd[:, :, :3].reshape(n, 3)])]
     )
+    # positions as the poses predict them: measured ones share their noise with the residuals
+    G = predicted(used, state)
+    column = np.concatenate([np.zeros(n), np.einsum("nji,nj->ni", G[:, :3, :3], G[:, :3, 3]).ravel()])
+    e = np.concatenate([lin.w.ravel(), lin.d.ravel()])
+    a, b = (max(float(part @ part) / n, 1e-30) for part in (e[:n], e[n:]))
+    for _ in range(_ROUNDS):
+        root = np.repeat([a**-0.5, b**-0.5], n)
+        left, size, _ = np.linalg.svd(
+            root[:, None] * J / np.maximum(np.linalg.norm(J, axis=0), 1e-30), full_matrices=False
+        )
+        Q, c = left[:, size > _OPEN * size[0]], root * column
+        own = c - Q @ (Q.T @ c)
+        known = float(own @ own)
+        if not known > (_OPEN * float(np.linalg.norm(c))) ** 2:
+            return None
+        s = -float(own @ (root * e)) / known
+        r = (e - (Q @ (Q.T @ (root * e))) / root) + s * own / root
+        taken = (Q**2).sum(axis=1) + own**2 / known
+        free_w, free_d = n - float(taken[:n].sum()), n - float(taken[n:].sum())
+        if min(free_w, free_d) < 1.0:
+            return None
+        a, b = (max(float(part @ part) / free, 1e-30) for part, free in ((r[:n], free_w), (r[n:], free_d)))
+    sigma = known**-0.5
+    whole = (1.0 + applied) * (1.0 + s) - 1.0
+    if not sigma < _VAGUE_SCALE:
+        return None
+    return s, sigma, float(f_tail((whole / sigma) ** 2, 1, free_d))

@@ -72,6 +72,32 @@ class HandEyeHeldOut:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CameraScale:
+    """A factor of all camera distances that the robot's motion asks for.
+
+    ``factor``: of the camera's positions, ``sigma`` its standard deviation, ``chance`` that a right scale looks as
+    wrong. ``poses``: X, Y, Z with the positions multiplied by the factor.
+    """
+
+    factor: float
+    sigma: float
+    chance: float
+    poses: dict[str, RigidTransform]
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, by how much, and the camera's pose without it."""
+        p = ", ".join(f"{1e3 * v:.1f}" for v in self.poses["X"].translation())
+        off = 100.0 * (self.factor - 1.0)
+        return (
+            f"The camera's distances seem {abs(off):.1f} % (+- {100 * self.sigma:.1f}) too"
+            f" {'short' if off > 0.0 else 'long'} for the robot's motion, which shifts the result. Check the target's"
+            " size, the focal length and the robot's unit. With the camera's positions (or the target's stated"
+            f" lengths) multiplied by {self.factor:.4f}, X is at ({p}) mm."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class HandEyeResult:
     """The unknown poses with their covariances, residuals and held-out errors.
 
@@ -82,7 +108,7 @@ class HandEyeResult:
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
     ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target
     where it holds. ``observation`` (n,): the observation that each sample belongs to; repeats of a pose are one.
-    Lengths are in the unit of the data.
+    ``scale``: of the camera's distances where it is wrong. Lengths are in the unit of the data.
     """
 
     equation: str
@@ -106,6 +132,7 @@ class HandEyeResult:
     extent: float
     observation: NDArray[np.int64]
     labels: dict[str, str] = field(default_factory=dict)
+    scale: CameraScale | None = None
 
     @property
     def X(self) -> RigidTransform:

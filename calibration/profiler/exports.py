@@ -37,6 +37,7 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds of the units of time that an export may state."""
 _NUMBERED = re.compile(r"(?i)(profile?|z|height|h|scan|head [a-z])?[ _.]*\d+|profile?|height")
 _UNIT = re.compile(r"(.*?)[ _.]*(?<![a-zµμ])[\[(]?(m|mm|cm|µm|μm|um|inch)[\])]?")
+_POINT = re.compile(r"(?i)(feature|edge)_?points?")
 _KEYS = re.compile(r"(?i)(scan_?line|profiles?|points?|line|xz|data)")
 _REPEATED = 5  # rows with one and the same pose that make a profile
 _RAW = 1e5  # integers beyond it are raw heights, in units of 0.01 micrometres
@@ -60,6 +61,7 @@ class Profiles:
             empty.
         poses: the poses of the same table, one for each profile, or None.
         single: whether each profile is one point of a table without a number of the scan.
+        found: the edge's point [x, z] (n, 2) in each profile, where the files hold it as well.
     """
 
     source: str
@@ -72,6 +74,7 @@ class Profiles:
     time_unit: str = ""
     poses: Listing | None = None
     single: bool = False
+    found: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -398,7 +401,10 @@ def _from_tree(path: Path) -> Profiles:
             f"'{path.name}' holds {held}; a profile is one list of [x, z] or [x, y, z] under a key such as scan_line."
         )
     key, a = named[0]
+    point = next((v for k, v in tree.items() if _POINT.fullmatch(k)), None) if isinstance(tree, dict) else None
+    at = np.zeros(0) if point is None else np.array([v for v in np.ravel(point) if isinstance(v, int | float)])
     return Profiles(
+        found=at[None, [0, -1]] if len(at) in (2, 3) else None,
         source=path.name,
         points=(_without_empty(a[:, [0, -1]]),),
         form="a document for each profile",
@@ -444,6 +450,7 @@ def joined(parts: list[Profiles], name: str) -> Profiles:
             f"The files of '{name}' state different units ({', '.join(sorted(u or 'none' for u in units))}); give one."
         )
     times = [p.times for p in parts if p.times is not None]
+    found = [p.found for p in parts if p.found is not None]
     return replace(
         parts[0],
         source=name,
@@ -452,5 +459,6 @@ def joined(parts: list[Profiles], name: str) -> Profiles:
         poses=None,
         times=np.concatenate(times) if len(times) == len(parts) else None,
         form=f"one file per profile, {parts[0].form}",
+        found=np.concatenate(found) if len(found) == len(parts) else None,
         single=False,
     )

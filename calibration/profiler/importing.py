@@ -41,12 +41,14 @@ class ImportedProfiles:
         single: whether each profile is one point.
         reading: how the file was understood: file, form and unit of the profiles and of the poses, and the rows left
             out.
+        found: the edge's point [x, z] (n, 2) m in each profile, where the files hold it.
     """
 
     profiles: tuple[Floats, ...] | None
     readings: tuple[PoseReading, ...]
     single: bool
     reading: dict[str, dict[str, object]]
+    found: Floats | None = None
 
 
 def import_profiles(
@@ -94,7 +96,8 @@ def import_profiles(
         },
         "robot": words,
     }
-    return ImportedProfiles(profiles=profiles, readings=readings, single=found.single, reading=reading)
+    points = None if found.found is None else UNITS[length] * found.found[kept]
+    return ImportedProfiles(profiles=profiles, readings=readings, single=found.single, reading=reading, found=points)
 
 
 def _poses_only(path: Path) -> Listing | None:

@@ -14,7 +14,7 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     "modules": 550,  # files with code in the five folders
-    "code lines": 99_485,  # without blank lines, comments and docstrings
+    "code lines": 101_785,  # without blank lines, comments and docstrings
     "lines of studies": 9_390,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments

@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
-from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, with_scale
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
@@ -287,6 +287,7 @@ def run_hand_eye(
             raise InputError("Motions (--motions) belong to ax-xb.")
         result = solve_ax_xb(pairs.robot, pairs.camera, config)
         problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
+        result = with_scale(problem, result, config)
     else:
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
@@ -308,7 +309,13 @@ def run_hand_eye(
         refined = _refined(pairs, config, said, optional=optional)
         if refined is not None and refined.accepted:
             adopted = True
-            result = replace(refined.result, labels=found.labels, equation=found.equation, warnings=result.warnings)
+            result = replace(
+                refined.result,
+                labels=found.labels,
+                equation=found.equation,
+                warnings=result.warnings,
+                scale=result.scale,
+            )
             pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
             problem = problem_of_pairs(pairs)
     if refine is not None and arm is not None:
@@ -446,10 +453,8 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    scale = scale_warning(problem, result)
-    return replace(
-        result, warnings=(*result.warnings, *explain_outliers(pairs, result), *([] if scale is None else [scale]))
-    )
+    explained = replace(result, warnings=(*result.warnings, *explain_outliers(pairs, result)))
+    return with_scale(problem, explained, config)
 
 
 def solve_arrays(

@@ -10,7 +10,7 @@ import numpy as np
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
-from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
+from weldcal.calibration.hand_eye.solve import CameraScale, HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
@@ -96,6 +96,7 @@ class HandEyeReport:
                 "unobservable": list(r.unobservable),
                 "warnings": list(r.warnings),
                 "condition": r.condition,
+                "camera_scale": None if r.scale is None else _of_scale(r.scale),
                 "method": r.method,
                 "reading": {who: dict(found) for who, found in self.reading.items()},
                 "notes": list(self.read_notes),
@@ -134,6 +135,12 @@ class HandEyeReport:
                     f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
                 ]
         return "\n".join(lines)
+
+
+def _of_scale(scale: CameraScale) -> dict[str, object]:
+    """What the JSON object has of a wrong scale: the factor, and the poses with it."""
+    of = {"factor": scale.factor, "sigma": scale.sigma, "chance": scale.chance}
+    return of | {f"{name}_scaled": pose for name, pose in scale.poses.items()}
 
 
 def _of_pictures(found: PictureResult) -> dict[str, object]:

@@ -33,6 +33,8 @@ _NAMES = {
     "model": ("model", ""),
     "model_reason": ("why this model", ""),
     "method": ("method", ""),
+    "z_grows": ("z of the profiles grows", ""),
+    "z_reason": ("by the profiles", ""),
     "rms_mm": ("residual, rms", "mm"),
     "reduced_chi2": ("reduced chi-square, 1 where the stated sigmas are right", ""),
     "condition": ("condition of the scans, 1 at best", ""),
@@ -189,6 +191,7 @@ def profiler_report(made: ProfilerFile) -> str:
             if judged
             else None
         ),
+        of="scans",
         seen=_seen(made.points),
         seam=None,
         rows=_rows(made.found),
@@ -207,6 +210,7 @@ def seam_report(seam: ProfilerSeam) -> str:
         title=f"Seam mapped from {seam.source}",
         subtitle=f"In the robot's base, by the calibration {seam.calibration}.",
         bars=None,
+        of="scans",
         seen=None,
         seam=_line(seam.root_mm),
         rows=_rows(seam.found),

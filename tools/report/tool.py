@@ -1,17 +1,21 @@
-"""Write the page of `tool check`: the tool from three sides, and what its finger camera sees."""
+"""Write the page of `tool check`: the tool from three sides, and what its finger camera sees; report a TCP."""
 
 import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.spatial import ConvexHull, QhullError
 
+from weldcal.calibration.geometry.robust import radius_95
+from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.tool.wire import TouchedTcp, WireTouch
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import flange_mesh
@@ -21,7 +25,16 @@ from weldcal.models.tool import ToolShape
 from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.models.tools.loading import LoadedTool
 from weldcal.systems.drivers.simulated.rendered_finger_camera import TagView
-from weldcal.tools.report.first_screen import CARE, USE
+from weldcal.tools.report.first_screen import (
+    CARE,
+    USE,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    expected_error,
+    limit_tolerance,
+)
 from weldcal.tools.report.pictures import subplots
 from weldcal.tools.report.render import render
 from weldcal.welding.servo.tool_axes import least_pipe_m
@@ -359,3 +372,83 @@ def _camera_view(axes: Axes, loaded: LoadedTool) -> None:
     axes.legend(fontsize=8, loc="lower right")
     axes.set_title(f"what the finger camera sees: tag {tool.tag_id} of {tool.tag_dictionary}", fontsize=10, loc="left")
     axes.set_xlabel("px")
+
+
+@dataclass(frozen=True, eq=False)
+class TcpReport:
+    """A TCP from touches, with the turn (3,) rad that it keeps, and the folder of the result."""
+
+    found: TouchedTcp
+    touches: tuple[WireTouch, ...]
+    read_as: str
+    turn: list[float]
+    limit_mm: float | None
+    folder: Path
+
+    @property
+    def set_tcp(self) -> str:
+        """The line of a UR program that sets it."""
+        return "set_tcp(p[{}])".format(", ".join(f"{v:.6f}" for v in (*self.found.wire.p_FW, *self.turn)))
+
+    @property
+    def worst(self) -> int:
+        """Number of the touch with the largest residual."""
+        return int(np.argmax(self.found.residual_m))
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; the error is the larger of the region's radius and that of left-out touches."""
+        f, what = self.found, "error of the TCP, 95 %"
+        used = np.array([t.id not in f.wire.left_out for t in self.touches])
+        held = 1e3 * f.held_out_m[np.isfinite(f.held_out_m) & used]
+        p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
+        expected, larger = expected_error(what, 1e3 * radius_95(f.wire.covariance), p95, len(held), "touches")
+        out = ", ".join(f.wire.left_out)
+        tolerance = limit_tolerance(what, larger, self.limit_mm)
+        concerns = [f"Touch {out} contradicts the others and was left out: repeat it."] if out else []
+        pose = ShownPose("X_FT", "pose of the TCP in the robot's flange F", self.X_FT)
+        after = Next(f"Set it at the robot: {self.set_tcp}. Touch the point again in a new orientation.", uses=True)
+        findings = Findings(tolerance=tolerance, unseen=len(held), concerns=concerns)
+        return FirstScreen(findings, expected, after, (pose,))
+
+    @property
+    def X_FT(self) -> RigidTransform:
+        """The TCP as a pose."""
+        return RigidTransform(RotationMatrix(exp_rotation(np.array(self.turn))), self.found.wire.p_FW)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        f = self.found
+        return {
+            "state": "done",
+            "X_FT": self.X_FT,
+            "tcp_mm": (1e3 * f.wire.p_FW).tolist(),
+            "covariance_mm2": (1e6 * f.wire.covariance).tolist(),
+            "error_95_mm": 1e3 * radius_95(f.wire.covariance),
+            "rms_mm": 1e3 * f.wire.rms_m,
+            "touches": [t.id for t in self.touches],
+            "residual_mm": [1e3 * float(v) for v in f.residual_m],
+            "held_out_mm": [None if np.isnan(v) else 1e3 * float(v) for v in f.held_out_m],
+            "worst_touch": self.touches[self.worst].id,
+            "left_out": list(f.wire.left_out),
+            "growth": f.growth,
+            "read_as": self.read_as,
+            "set_tcp": self.set_tcp,
+            "folder": str(self.folder),
+        }
+
+    def rows(self) -> dict[str, str]:
+        """What was found, in lines."""
+        f = self.found
+        sigma = 1e3 * np.sqrt(np.diag(f.wire.covariance))
+        return {
+            "TCP": "({:.2f}, {:.2f}, {:.2f}) mm".format(*(1e3 * f.wire.p_FW).tolist()),
+            "one sigma": "({:.2f}, {:.2f}, {:.2f}) mm".format(*sigma),
+            "touches off the point": ", ".join(
+                f"{t.id}: {1e3 * v:.2f}" for t, v in zip(self.touches, f.residual_m, strict=True)
+            )
+            + " mm",
+            "worst touch": f"{self.touches[self.worst].id}, {1e3 * f.residual_m[self.worst]:.2f} mm",
+            "poses read as": self.read_as,
+            "UR": self.set_tcp,
+        }

@@ -24,11 +24,12 @@ class WiredProfiler(RenderedProfiler):
 
     SIMULATED: ClassVar[bool] = False
     unit: str = "mm"  # of the points: m or mm
+    heights_from_mm: float | None = None  # where z grows towards the sensor: the sensor's distance at z = 0
     scan_timeout_s: float = 2.0
     latency_s: float = 0.0
 
 
-def checked_profile(points: NDArray[Any], metres: float, config: RenderedProfiler) -> Profile:
+def checked_profile(points: NDArray[Any], metres: float, config: WiredProfiler) -> Profile:
     """Points (n, 2) [x, z] m, NaN where nothing was measured.
 
     Raises:
@@ -37,13 +38,16 @@ def checked_profile(points: NDArray[Any], metres: float, config: RenderedProfile
     profile = np.asarray(points, dtype=np.float64) * metres
     if profile.ndim != 2 or profile.shape[1] != 2:
         raise Garbage(f"a profile is (n, 2), and this one is {profile.shape}")
+    if config.heights_from_mm is not None:
+        profile[:, 1] = 1e-3 * config.heights_from_mm - profile[:, 1]
     profile[~np.isfinite(profile).all(axis=1)] = np.nan
     z = profile[np.isfinite(profile[:, 1]), 1]
     if z.size < FEWEST_POINTS:
         raise Garbage(f"the profile has {z.size} points; look whether something is in the profiler's range")
     if not 0.0 < np.median(z) <= FAR * 1e-3 * config.farthest_mm:
         raise Garbage(
-            f"the middle of the profile is {np.median(z):.3g} m away: set profiler.unit to the unit of its points"
+            f"the middle of the profile is {np.median(z):.3g} m away: set profiler.unit to the unit of its points, and"
+            " profiler.heights_from_mm where z grows towards the sensor"
         )
     return profile
 

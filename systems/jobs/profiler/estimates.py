@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.profiler.depth_sign import with_sign
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.features.groove import groove_features
@@ -111,17 +112,24 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
         WeldcalError: the scans do not show one edge, or are not informative enough; see edge_joint.
     """
     sigmas = feature_sigmas(p, 0.5e-3 * (job.near_mm + job.far_mm))
-    robot = 1e-3 * job.robot_sigma_mm
+    robot, width = 1e-3 * job.robot_sigma_mm, 1e-3 * job.straightedge.width_mm
     seen: dict[str, tuple[list[Array], list[Array]]] = {"scan": ([], []), "held_out": ([], [])}
     lost = 0
     for one in taken:
         try:
-            point, _ = extract_edge(_one_background(one.points, 1e-3 * job.straightedge.width_mm), "bar", "left")
+            point, _ = extract_edge(_one_background(one.points, width), "bar", "left")
         except FeatureNotFound:
             lost += 1
             continue
         seen[one.kind][0].append(one.q)
         seen[one.kind][1].append(point)
+    turned = [_one_background(one.points * [1.0, -1.0], width) for one in taken]
+    shown = len(taken) - lost
+    if (heights := len(with_sign(turned, lambda p: extract_edge(p, "bar", "left")[0], "away")[0])) > 2 * shown:
+        raise FeatureNotFound(
+            f"z of the profiles grows towards the sensor: {heights} of {len(taken)} profiles show the straightedge so,"
+            f" and {shown} with z away from it. Set profiler.heights_from_mm to the sensor's distance at z = 0."
+        )
     _enough(len(seen["scan"][1]), taken, "the straightedge's edge")
     poses, points = flange_poses(arm, seen["scan"][0]), np.array(seen["scan"][1])
     e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)

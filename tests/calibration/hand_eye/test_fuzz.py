@@ -9,7 +9,7 @@ import pytest
 
 from tests.calibration.hand_eye.poses import Array, eye_in_hand, random_poses
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mistakes import likely_mistake, wrong_scale
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
@@ -57,13 +57,13 @@ def test_a_target_of_another_size_is_told_and_a_right_one_is_not() -> None:
     F, G, _, _ = eye_in_hand(25, np.random.default_rng(4), np.radians(0.05), 2e-4)
     G = G.copy()
     right = full_problem(F, G)
-    assert scale_warning(right, solve_problem(right, config=QUICK)) is None
+    assert wrong_scale(right, solve_problem(right, config=QUICK)) is None
     G[:, :3, 3] *= 1.02
     wrong = full_problem(F, G)
-    said = scale_warning(wrong, solve_problem(wrong, config=QUICK))
-    assert said is not None
-    assert "2.0 %" in said
-    assert "too long" in said
+    found = wrong_scale(wrong, solve_problem(wrong, config=QUICK))
+    assert found is not None
+    assert found.factor == pytest.approx(1.0 / 1.02, abs=4.0 * found.sigma)
+    assert "too long" in found.sentence
 
 
 def test_samples_that_are_one_apart_are_told() -> None:

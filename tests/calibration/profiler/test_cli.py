@@ -162,7 +162,7 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
         (("edge", "e.csv", "--feature", "bar"), "no profiles"),
         (
             ("edge", "flat.csv", "--feature", "step"),
-            "None of the 8 profiles shows the feature step with its near face on the left. Try --side right",
+            "None of the 8 profiles shows the feature step with its near face on the left, with z away from the sensor or",
         ),
         (("edge", "e.csv", "--sigma-x", "0"), "must be positive"),
         (("edge", "bad.csv"), "has the columns a, b: no x and z of profile points. Name them px_mm and pz_mm"),

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
-from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.header import DatasetHeader, PoseForm
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.tool.comparison import (
     EXCEEDED,
@@ -24,21 +24,23 @@ from weldcal.calibration.tool.comparison import (
     wire_sigma,
 )
 from weldcal.calibration.tool.measure import Move, NozzlePart, ToolMeasurement, find_ring, measure_tool, tool_scans
-from weldcal.calibration.tool.wire import read_wire_touches
+from weldcal.calibration.tool.wire import find_tcp, read_wire_touches
 from weldcal.models.errors import InputError
+from weldcal.models.files import sha256
 from weldcal.models.tools.loading import check_sight, load_tool, tool_file
 from weldcal.systems.jobs.tool_scan.planner import FEWEST, MOST, ToolScanConfig, check_tool_scan
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, WeldingConfig
-from weldcal.tools.cli.options import LIVE, Call, Outcome, command, option
+from weldcal.tools.cli.options import LIVE, Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.console import emit_summary
-from weldcal.tools.report.first_screen import typed
+from weldcal.tools.report.first_screen import check_limit, typed
+from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import render, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
+from weldcal.tools.report.tool import TcpReport, ToolCheck, tool_picture, tool_report
 
 MEASURED_TOOL = "tool_measurement.json"
 
@@ -154,6 +156,68 @@ def tool_measure(
     return Outcome(report.summary(), values={}, rows=report.rows(call.verbose))
 
 
+@command("tool tcp", short_help="Find the TCP from touches of one point.")
+def tool_tcp(
+    call: Call,
+    file: Annotated[
+        Path, typer.Argument(metavar="TOUCHES", help="Flange poses at four or more touches of one point, in any form.")
+    ],
+    unit: Annotated[str, option("--unit", "U", "m or mm, of the positions.", show_default="the file's")] = "auto",
+    robot_form: Annotated[
+        str, option("--robot-form", "FORM", "How the poses are written, such as rotation_vector,deg.")
+    ] = "",
+    tcp: Annotated[
+        str,
+        option("--tcp", "X,Y,Z,RX,RY,RZ", "The TCP (mm, rad) of the poses, where it was not zero; its turn is kept."),
+    ] = "",
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Find the TCP as a pendant's four-point method does, with its uncertainty and the error of each touch."""
+    check_limit(limit_mm)
+    if unit not in ("auto", "m", "mm"):
+        raise InputError(f"The unit is m or mm, not '{unit}'.")
+    old = _six(tcp)
+    form = PoseForm(rotation=robot_form, tcp=old if tcp else [])
+    touches, read_as = read_wire_touches(file, form, unit, must_decide=True)
+    folder = call.folder("tool-tcp", file.stem)
+    report = TcpReport(find_tcp(touches), touches, read_as, old[3:], limit_mm, folder)
+    write_atomic(folder / "set_tcp.script", report.set_tcp + "\n")
+    write_json(folder / "tcp.json", report.summary())
+    held = report.found.held_out_m
+    page = render(
+        "profiler_file.html.j2",
+        first=report.first,
+        title=f"TCP from {file.name}",
+        subtitle=f"{len(touches)} touches. {report.set_tcp}",
+        bars=(
+            error_bars([t.id for t in touches], 1e3 * held, np.ones(len(held), bool), "left-out touch, mm")
+            if np.isfinite(held).any()
+            else None
+        ),
+        of="touches",
+        seen=None,
+        seam=None,
+        rows=list(report.rows().items()),
+        sigma=[],
+        warnings=[],
+        lists=[],
+        digest=sha256(file),
+    )
+    write_atomic(folder / "report.html", page)
+    return Outcome(report.summary(), values={}, rows=report.rows(), first=report.first)
+
+
+def _six(text: str) -> list[float]:
+    """Six numbers of a TCP, in metres and radians; zeros for an empty text. Raises InputError."""
+    try:
+        values = [float(v) for v in text.strip().removeprefix("p").strip("[] ").split(",")] if text else [0.0] * 6
+    except ValueError:
+        values = []
+    if len(values) != 6 or not np.isfinite(values).all():
+        raise InputError(f"--tcp holds six numbers, x,y,z in mm and rx,ry,rz in rad, not '{text[:60]}'.")
+    return [1e-3 * v for v in values[:3]] + values[3:]
+
+
 @dataclass(frozen=True, kw_only=True)
 class MeasureOrder:
     """What the command was given."""
@@ -242,7 +306,7 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
     """
     loaded = load_tool(order.tool)
     calibration = load_result(order.calibration)
-    touches = () if order.touches is None else read_wire_touches(order.touches)
+    touches = () if order.touches is None else read_wire_touches(order.touches)[0]
     welding = WeldingConfig() if order.scenario is None else load_scenario(order.scenario).welding
     tell("reading the scans", 0.05)
     data = load_dataset(order.dataset)

@@ -5,6 +5,8 @@ the export of an instrument, or a folder with one file per profile. Of a profile
 is found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -13,17 +15,18 @@ import typer
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.errors import FeatureNotFound
-from weldcal.calibration.motion.line_clock import offset_from_line
+from weldcal.calibration.motion.line_clock import LineClock, offset_from_line
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, checked_sign, choose_sign, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.exports import SECONDS, TABLES, TREES, UNITS, Profiles
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.importing import profile_unit, profiles_of
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.record import load_record
+from weldcal.calibration.profiler.record import ProfilerRecord, load_record
 from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import read_text
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
@@ -34,6 +37,7 @@ from weldcal.tools.commands.profiler.result import (
     PosesOption,
     TrialOption,
     UnitOption,
+    ZOption,
     check_number,
     outcome_of,
     with_warnings,
@@ -44,6 +48,7 @@ from weldcal.tools.report.render import csv_text, write_atomic, write_json
 
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
 _STREAM, _TIMES = "stream.csv", "times.csv"
+_ALIKE = 3.0  # standard deviations within which two offsets are one
 _NEAR_S = 0.5  # offset of the clocks that is searched
 # Of the stream that the profiles last at least: seconds that are read as milliseconds last 0.002 of it at most
 _SHARE = 0.01
@@ -63,6 +68,7 @@ def clock(
     ] = "bar",
     side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
     pitch: PitchOption = None,
+    z: ZOption = "",
 ) -> Outcome:
     """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
     out = call.folder("profiler", folder.resolve().name)
@@ -76,10 +82,10 @@ def clock(
     profiles = profiles_of(source, pitch)[0]
     motion = ContinuousMotion(stream)
     stamps, time_unit = _stamps(folder, profiles, motion)
-    time, points, lost = _crossings(profiles, stamps, UNITS[profile_unit(profiles, unit)], feature, side)
+    scale = UNITS[profile_unit(profiles, unit)]
+    found, time, lost, words = _offset(record, motion, profiles, stamps, scale, partial(_edge, feature, side), z)
     if record.arm is not None:
         said.append("The calibration corrects the arm's joints; the stream's poses are used as they are.")
-    found = offset_from_line(time, record.points_F(points), np.eye(4), motion)
     result: dict[str, object] = {
         "state": "done",
         "clock_offset_ms": 1e3 * found.offset_s,
@@ -87,6 +93,7 @@ def clock(
         "rms_mm": 1e3 * found.rms_m,
         "rms_before_mm": 1e3 * found.before_m,
         "profiles": len(time),
+        **words,
         "reading": {"file": profiles.source, "form": profiles.form, "time_unit": time_unit},
         "without_feature": lost,
         "edge": {"point": found.point.tolist(), "direction": found.direction.tolist()},
@@ -155,21 +162,64 @@ def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple
     )
 
 
-def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, side: str) -> tuple[Array, Array, int]:
-    """Find times (n,) s and points (n, 2) m where profiles cross the edge, and how many do not show it."""
-    kept, points, lost = [], [], 0
-    for t, found in zip(stamps, profiles.points, strict=True):
-        at = scale * found
+def _edge(feature: str, side: str, profile: Array) -> Array:
+    """Point (2,) m at which a profile crosses the edge, z away from the sensor; of one point itself."""
+    if len(profile) == 1:
+        return profile[0]
+    return extract_edge(profile, cast(Kind, feature), cast(Literal["left", "right"], side))[0]
+
+
+def _offset(
+    record: ProfilerRecord,
+    motion: ContinuousMotion,
+    profiles: Profiles,
+    stamps: Array,
+    scale: float,
+    extract: Callable[[Array], Array],
+    z: str,
+) -> tuple[LineClock, Array, int, dict[str, str]]:
+    """Find the clock's offset, the times (n,) s of the crossings, the profiles without one, and the sign of z."""
+    fits, found, total = {}, {}, len(profiles)
+    for grows in checked_sign(z):
+        at, lost = with_sign([scale * p for p in profiles.points], extract, grows)
+        points, time = np.array(at).reshape(-1, 2), np.delete(stamps, lost)
+        good = np.isfinite(points).all(axis=1) & np.isfinite(time)
+        n = int(good.sum())
         try:
-            if len(at) > 1:
-                at = extract_edge(at, cast(Kind, feature), cast(Literal["left", "right"], side))[0][None]
-        except FeatureNotFound:
-            lost += 1
+            line = offset_from_line(time[good], record.points_F(points[good]), np.eye(4), motion)
+        except WeldcalError as error:
+            fits[grows] = SignFit(shown=n, error=error)
             continue
-        if np.isfinite(at).all() and np.isfinite(t):
-            kept.append(float(t))
-            points.append(at[0])
-    return np.array(kept), np.array(points).reshape(-1, 2), lost
+        found[grows] = line, time[good], len(lost)
+        fits[grows] = SignFit(shown=n, kept=n, variance=line.rms_m**2, freedom=2 * n - 5)
+        if all(len(p) == 1 for p in profiles.points):  # crossings have no feature to seek
+            return *found[grows], {}
+
+    def alike() -> bool:
+        (a, *_), (b, *_) = found.values()
+        return abs(a.offset_s - b.offset_s) < _ALIKE * np.hypot(a.sigma_s, b.sigma_s)
+
+    grows, words = _chosen(fits, record, total, "edge", alike)
+    return *found[grows], words
+
+
+def _chosen(
+    fits: dict[str, SignFit], record: ProfilerRecord, total: int, what: str, alike: Callable[[], bool]
+) -> tuple[str, dict[str, str]]:
+    """Return the sign of z and the words on it; the calibration's own where the profiles do not contradict it.
+
+    Raises InputError where they do: X_FS holds for one sign only.
+    """
+    own = next((g for g, word in WORDS.items() if word == record.figures.get("z_grows")), "")
+    if own in fits and 2 * fits[own].kept >= max(fit.kept for fit in fits.values()) > 0:
+        fits = {own: fits[own]}
+    grows, reason = choose_sign(fits, total, what, alike)
+    if own and grows != own:
+        raise InputError(
+            f"z grows {WORDS[grows]} in these profiles and {WORDS[own]} in those of the calibration, and X_FS holds for"
+            " one of both. Calibrate with profiles of this form."
+        )
+    return grows, {"z_grows": WORDS[grows], "z_reason": reason}
 
 
 @command("profiler seam", short_help="Map a V-groove in the base frame.")
@@ -183,13 +233,14 @@ def seam(
     robot_form: FormOption = "",
     pitch: PitchOption = None,
     limit_mm: LimitOption = None,
+    z: ZOption = "",
 ) -> Outcome:
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
     check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)
     data = read_profiler_file(file, unit=unit, trial=trial, stated=PosesStated(poses, robot_form, pitch))
     data = _as_calibrated(data, calibration)
-    found = with_warnings(data, map_seam(data, calibration, folder))
+    found = with_warnings(data, map_seam(data, calibration, folder, z))
     return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
 
 
@@ -209,7 +260,7 @@ def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
     return data
 
 
-def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, Any]:
+def map_seam(file: Measurements, calibration: Path, folder: Path, z: str = "") -> dict[str, Any]:
     """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
     record = load_record(calibration)
     if file.profiles is None:
@@ -217,30 +268,37 @@ def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, A
     poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
     check_number(poses, (len(file.profiles),), "profiles")
     columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
-    rows, lost, rms, seen = [], [], [], []
-    for k, p in enumerate(file.profiles):
-        try:
-            f = groove_features(p)
-        except FeatureNotFound:
-            lost.append(k)
-            continue
-        seen.append(record.points_F(f.points))
-        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
-        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
-        rms.append(f.rms_m)
-    if not rms:
+    found = {grows: with_sign(file.profiles, _groove, grows) for grows in checked_sign(z)}
+    fits = {g: SignFit(shown=len(at), kept=len(at), variance=1.0, freedom=len(at)) for g, (at, _) in found.items()}
+    if not any(fit.shown for fit in fits.values()):
         raise FeatureNotFound(
-            "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
+            f"None of the {len(poses)} profiles shows a V-groove with plate on both sides, with z"
+            f" {' or '.join(WORDS[g] for g in fits)}. Check the file and its unit."
         )
+    grows, words = _chosen(fits, record, len(poses), "groove", lambda: False)
+    features, lost = found[grows]
+    rows, rms, seen = [], [], []
+    for k, f in zip(np.delete(np.arange(len(poses)), lost), features, strict=True):
+        seen.append(record.points_F(f[:3]))
+        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
+        rms.append(float(f[3, 0]))
+        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * rms[-1]:.4f}"])
     write_atomic(folder / "seam.csv", csv_text(columns, rows))
     return {
         "scans": len(poses),
         "found": len(rms),
         "without_groove": lost,
+        **words,
         "rms_mm": 1e3 * float(np.median(rms)),
         "error_95_mm": middle_error_mm(record, np.vstack(seen)),
         "method": record.method,
     }
+
+
+def _groove(profile: Array) -> Array:
+    """Rows (4, 2) m: edge, root and edge of a groove, z away from the sensor, and the rms of its samples."""
+    f = groove_features(profile)
+    return np.vstack([f.points, [f.rms_m, 0.0]])
 
 
 def finish_seam(

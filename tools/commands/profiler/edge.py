@@ -1,19 +1,26 @@
 """weldcal profiler edge: the pose on the flange from points of one straight edge."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from weldcal.calibration.errors import FeatureNotFound, InconsistentData
+from weldcal.calibration.errors import InconsistentData
+from weldcal.calibration.geometry.robust import chi2_quantile
+from weldcal.calibration.geometry.se3 import log_rotation
+from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, beats, checked_sign, choose_sign, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
-from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge.joint import OUTLIER, EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import Field, plan_edge_poses, sample_edge_poses
 from weldcal.calibration.profiler.reading_choice import edge_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.result import believed_covariance
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
@@ -30,6 +37,7 @@ from weldcal.tools.commands.profiler.result import (
     Sigmas,
     TrialOption,
     UnitOption,
+    ZOption,
     check_number,
     figures_of,
     finish,
@@ -46,6 +54,7 @@ STARTS = (1.0, 2.0, 4.0)  # times the usual sigmas, for noisier sensors
 MOST = 6.0
 SETTLED = 1.15  # residuals up to this many times the sigmas agree with them
 FOLDS = 5
+ALIKE = 0.9  # a choice: share of pairs of estimates of one pose that are closer
 
 ESTIMATED = "the file's, else estimated from the points, at least {}"
 
@@ -63,6 +72,7 @@ def edge(
     method: Annotated[str, option("--method", "M", "joint, or paper (the published linear method).")] = "joint",
     feature: Annotated[str, option("--feature", "KIND", "For raw profiles: bar, step or apex.")] = "",
     side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
+    z: ZOption = "",
     sigma_robot: Annotated[
         float | None, option("--sigma-robot", "MM", ROBOT_SIGMA, show_default=ESTIMATED.format(0.03))
     ] = None,
@@ -83,62 +93,141 @@ def edge(
     guess."""
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
-    robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
-    sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
+    sigmas = Sigmas(
+        *(1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True)),
+        stated=any(v is not None for v in given),
+    )
     data = read_profiler_file(
         file, unit=unit, dataset=dataset, trial=trial, stated=PosesStated(poses, robot_form, pitch)
     )
-    data = _decided(data, feature, side)
-    record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=call.seed)
-    points, _ = edge_points(data, feature, side)
-    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    held = np.zeros(0)
+    if not sigmas.stated and "sigma" in data.arrays:
+        sigmas = Sigmas(*(float(v) for v in data.arrays["sigma"]))
+    shown = edge_shown(data, sigmas, feature, side, z)
+    record, found = calibrate_edge(shown, sigmas, method=method, plan=plan, seed=call.seed)
+    data, held = shown.file, np.zeros(0)
     if "sigmas_mm" in found:  # the paper's method has no sigmas, and nothing is left out
-        held = edge_held_out(cast(FlangePoses, data.poses())[keep], points[keep], found["sigmas_mm"])
+        held = edge_held_out(*shown.seen(), found["sigmas_mm"])
     folder = call.folder("profiler", file.stem)
-    made, summary = finish(record, with_warnings(data, found), points[keep], held, file.name, folder, limit_mm)
+    made, summary = finish(record, with_warnings(data, found), shown.seen()[1], held, file.name, folder, limit_mm)
     return outcome_of(call, summary, made)
 
 
-def _decided(data: Measurements, feature: str, side: str) -> Measurements:
-    """Return the measurements with the reading of the poses that the edge selects."""
-    if len(data.readings) < 2:
-        return data
-    points, _ = edge_points(data, feature, side)
-    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    if points.shape != (len(data.readings[0].X), 2):
-        return data
-    fit = edge_fit(points[keep])
-    return data.decided(lambda poses: fit(poses[keep]), "edge")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EdgeShown:
+    """Points (n, 2) m of the edge, NaN where a profile shows none, in measurements with one reading of the poses.
+
+    Attributes:
+        lost: numbers of the profiles without the edge.
+        fit: the estimate by these points with its sigmas, where the choice of the sign made one.
+        words: values of the JSON object on the sign of z.
+    """
+
+    file: Measurements
+    points: Floats
+    lost: list[int] = field(default_factory=list)
+    fit: tuple[EdgeEstimate, Sigmas] | None = None
+    words: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def keep(self) -> NDArray[np.bool_]:
+        """Profiles (n,) that show the edge."""
+        return np.asarray(np.isfinite(self.points).all(axis=1), bool)
+
+    def seen(self) -> tuple[FlangePoses, Floats]:
+        """Poses and points (k, 2) m of the profiles that show the edge."""
+        poses = cast(FlangePoses, self.file.poses())
+        check_number(poses, self.points.shape, "profile points [x, z]", (2,))
+        return poses[self.keep], self.points[self.keep]
+
+    def decided(self) -> "EdgeShown":
+        """Return the same with the reading of the poses that the edge selects."""
+        if len(self.file.readings) < 2 or self.points.shape != (len(self.file.readings[0].X), 2):
+            return self
+        keep, fit = self.keep, edge_fit(self.points[self.keep])
+        return replace(self, file=self.file.decided(lambda poses: fit(poses[keep]), "edge"))
+
+
+def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: str) -> EdgeShown:
+    """Return the points of the edge: the file's own, or those of the feature in its raw profiles.
+
+    Of raw profiles each sign of z is tried that is not excluded by ``z``.
+    """
+    if side not in ("left", "right"):
+        raise InputError(f"The side is left or right, not '{side}'.")
+    signs = checked_sign(z)
+    if not feature:
+        why = "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
+        return EdgeShown(file=file, points=file.needed("points", why)).decided()
+    if feature not in FEATURES:
+        raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
+    if file.profiles is None:
+        raise InputError("The file has no profiles to detect an edge in. Omit --feature.")
+    total, other_side = len(file.profiles), "right" if side == "left" else "left"
+    tried = {grows: _tried(file, sigmas, feature, side, grows) for grows in signs}
+    fits = {grows: fit for grows, (_, fit) in tried.items()}
+    if total and not any(fit.shown for fit in fits.values()):
+        other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
+        raise InputError(
+            f"None of the {total} profiles shows the feature {feature} with its near face on the {side}, with z"
+            f" {' or '.join(WORDS[grows] for grows in signs)}. Try --side {other_side}, or"
+            f" {other}."
+        )
+    grows, reason = choose_sign(fits, total, feature, lambda: _alike([one.fit for one, _ in tried.values()]))
+    if not z and feature != "apex":
+        # one jump is the end of the near face with one sign and side, and that of the far face with both exchanged
+        opposite = next(sign for sign in signs if sign != grows)
+        twin, there = _tried(file, sigmas, feature, other_side, opposite)
+        if there.kept and not beats(fits[grows], there) and not _alike([tried[grows][0].fit, twin.fit]):
+            raise InconsistentData(
+                f"The profiles do not show which face of the {feature} is near. With the near face on the {side} and z"
+                f" {WORDS[grows]}, {fits[grows].kept} of {total} agree on one edge. With it on the {other_side} and z"
+                f" {WORDS[opposite]}, {there.kept} agree on another. State z: --side {side} --z {grows}, or"
+                f" --side {other_side} --z {opposite}. Heights (Gocator, Keyence) grow towards the sensor."
+            )
+    return replace(tried[grows][0], words={"z_grows": WORDS[grows], "z_reason": reason})
+
+
+def _tried(file: Measurements, sigmas: Sigmas, feature: str, side: str, grows: str) -> tuple[EdgeShown, SignFit]:
+    """Return what the profiles show with one sign of z, and how far one edge explains it."""
+    profiles = file.profiles or ()
+    at, lost = with_sign(profiles, partial(_point, feature, side), grows)
+    points = np.full((len(profiles), 2), np.nan)
+    points[np.setdiff1d(np.arange(len(profiles)), lost)] = np.array(at).reshape(-1, 2)
+    one = EdgeShown(file=file, points=points, lost=lost)
+    try:
+        one = one.decided()
+        e, s = edge_by_noise(*one.seen(), sigmas)
+        believed_covariance(e)  # refuses what is too vague to compare
+    except WeldcalError as error:
+        return one, SignFit(shown=len(at), error=error)
+    kept, free = int(e.inliers.sum()), 2 * len(at) - 10
+    square = (2 * kept - 10) * e.reduced_chi2 + (len(at) - kept) * OUTLIER**2
+    variance = square / free * (s.x_m / sigmas.x_m) ** 2
+    return replace(one, fit=(e, s)), SignFit(shown=len(at), kept=kept, variance=variance, freedom=free)
+
+
+def _point(feature: str, side: str, profile: Floats) -> Floats:
+    return extract_edge(profile, cast(Kind, feature), "left" if side == "left" else "right")[0]
+
+
+def _alike(fits: Sequence[tuple[EdgeEstimate, Sigmas] | None]) -> bool:
+    """Test whether two estimates are one pose, by their covariances."""
+    (a, _), (b, _) = (cast(tuple[EdgeEstimate, Sigmas], fit) for fit in fits)
+    turn = log_rotation((a.rotation @ b.rotation.T)[None])[0]
+    d = np.concatenate([turn, a.translation - b.translation])
+    C = believed_covariance(a) + believed_covariance(b)
+    return bool(d @ np.linalg.solve(C, d) < chi2_quantile(ALIKE, 6))
 
 
 def calibrate_edge(
-    file: Measurements,
-    sigmas: Sigmas,
-    *,
-    method: str = "joint",
-    feature: str = "",
-    side: str = "left",
-    plan: int = 0,
-    seed: int = 0,
+    shown: EdgeShown, sigmas: Sigmas, *, method: str = "joint", plan: int = 0, seed: int = 0
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
-    """X_FS from one straight edge: points, or raw profiles with the kind of edge that they show."""
+    """X_FS from the points of one straight edge."""
     if method not in ("joint", "paper"):
         raise InputError(f"The method is joint or paper, not '{method}'.")
-    if side not in ("left", "right"):
-        raise InputError(f"The side is left or right, not '{side}'.")
-    poses = cast(FlangePoses, file.poses())
-    points, lost = edge_points(file, feature, side)
-    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    if feature and len(keep) and not keep.any():
-        other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
-        raise InputError(
-            f"None of the {len(keep)} profiles shows the feature {feature} with its near face on the {side}. "
-            f"Try --side {'right' if side == 'left' else 'left'}, or {other}."
-        )
-    check_number(poses, points.shape, "profile points [x, z]", (2,))
-    poses, points = poses[keep], points[keep]
-    found: dict[str, Any] = {"scans": len(keep), "without_feature": lost}
+    file, keep = shown.file, shown.keep
+    poses, points = shown.seen()
+    found: dict[str, Any] = {"scans": len(keep), "without_feature": shown.lost, **shown.words}
     if method == "paper":
         group = file.arrays["group"][keep] if "group" in file.arrays else rotation_groups(poses)
         linear = edge_linear(poses.rotation, poses.translation, points, group)
@@ -156,10 +245,7 @@ def calibrate_edge(
             data_sha256=file.digest,
         )
         return record, found
-    if not sigmas.stated and "sigma" in file.arrays:
-        robot, x, z = (float(v) for v in file.arrays["sigma"])
-        sigmas = Sigmas(robot, x, z)
-    e, sigmas = edge_by_noise(poses, points, sigmas)
+    e, sigmas = shown.fit or edge_by_noise(poses, points, sigmas)
     e, xz = widened(e), np.array([sigmas.x_m, sigmas.z_m])
     found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
     found |= figures_of(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
@@ -175,29 +261,6 @@ def calibrate_edge(
         )
         found["next_poses"] = next_poses(candidates, chosen.chosen, chosen.rms_m)
     return ProfilerRecord.of("edge, joint", e, found, file.digest), found
-
-
-def edge_points(file: Measurements, feature: str, side: str) -> tuple[Floats, list[int]]:
-    """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
-    if not feature:
-        return (
-            file.needed(
-                "points",
-                "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)",
-            ),
-            [],
-        )
-    if feature not in FEATURES:
-        raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
-    if file.profiles is None:
-        raise InputError("The file has no profiles to detect an edge in. Omit --feature.")
-    points, lost = np.full((len(file.profiles), 2), np.nan), []
-    for k, p in enumerate(file.profiles):
-        try:
-            points[k], _ = extract_edge(p, cast(Kind, feature), "left" if side == "left" else "right")
-        except FeatureNotFound:
-            lost.append(k)
-    return points, lost
 
 
 def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[EdgeEstimate, Sigmas]:

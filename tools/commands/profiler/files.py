@@ -205,6 +205,8 @@ def _imported(path: Path, unit: str | None, stated: PosesStated) -> Measurements
     arrays = {"rotation": poses.rotation, "translation": poses.translation}
     if found.profiles is not None and all(len(p) == 1 for p in found.profiles):
         arrays["points"] = np.vstack(found.profiles)
+    if found.found is not None:
+        arrays["points"] = found.found
     told = cut_off(path) if found.single and path.suffix.lower() == ".csv" else None
     return Measurements(
         arrays=arrays,

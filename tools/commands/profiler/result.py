@@ -41,6 +41,9 @@ FormOption = Annotated[
 PitchOption = Annotated[
     float | None, option("--pitch", "MM", "Distance of the points, where the export holds heights only.")
 ]
+ZOption = Annotated[
+    str, option("--z", "SIGN", "away or towards the sensor: where z of raw profiles grows. Without it the data decide.")
+]
 SetOption = Annotated[str, option("--set", "NAME", "Which set of an NPZ with several.")]
 TrialOption = Annotated[int | None, option("--trial", "K", "Which trial or world of an NPZ with several.")]
 ROBOT_SIGMA, Z_SIGMA = "Standard deviation of the robot's position per axis.", "Standard deviation of a point in depth."

@@ -10,8 +10,9 @@ import pytest
 
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.sensors.acquisition import Garbage
 from weldcal.systems.drivers.sensors.folder_profiler import FolderProfiler, read_profile
-from weldcal.systems.drivers.sensors.wired_profiler import acquire_profiles
+from weldcal.systems.drivers.sensors.wired_profiler import acquire_profiles, checked_profile
 
 
 def test_a_profile_in_a_file_answers_the_request(tmp_path: Path) -> None:
@@ -50,3 +51,11 @@ def test_what_is_no_profile_is_named(tmp_path: Path) -> None:
         read_profile(tmp_path / "b.csv")
     with pytest.raises(InputError, match=r"profiler\.unit must be m or mm"):
         FolderProfiler(folder=str(tmp_path), unit="inch").source()
+
+
+def test_heights_become_distances() -> None:
+    heights = np.column_stack([np.linspace(-20.0, 20.0, 41), np.linspace(-30.0, 10.0, 41)])
+    with pytest.raises(Garbage, match=r"profiler\.heights_from_mm where z grows towards the sensor"):
+        checked_profile(heights, 1e-3, FolderProfiler())
+    found = checked_profile(heights, 1e-3, FolderProfiler(heights_from_mm=190.0))
+    assert np.allclose(found[[0, -1]], [[-0.02, 0.22], [0.02, 0.18]])
