@@ -9,6 +9,7 @@ import numpy as np
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.readings import PoseNumbers, PoseReading, parse_form, readings
 from weldcal.calibration.errors import DatasetError
+from weldcal.models.arms.chain import chain_poses, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.files import LARGEST_NUMBER, MOST_POSES
 
@@ -29,6 +30,7 @@ class Listing:
         unit: the unit of length that the file states, or empty.
         form: a phrase for the reader, such as "UR pose vectors".
         left_out: rows (from 0) that hold no pose, with the reason.
+        joints: joint angles (n, joints) rad of the robot, or None; without ``numbers`` they stand for the poses.
     """
 
     name: str
@@ -38,9 +40,10 @@ class Listing:
     unit: str = ""
     form: str = ""
     left_out: tuple[tuple[int, str], ...] = ()
+    joints: Array | None = None
 
     def __len__(self) -> int:
-        return len(self.numbers[0].p)
+        return len(self.numbers[0].p) if self.numbers or self.joints is None else len(self.joints)
 
     @cached_property
     def readings(self) -> tuple[PoseReading, ...]:
@@ -51,6 +54,11 @@ class Listing:
         """
         found: list[PoseReading] = []
         problem: DatasetError | None = None
+        if not self.numbers:
+            raise DatasetError(
+                f"'{self.name}' holds joint angles and no poses: name the arm by --robot or in dataset.yaml, for example"
+                " ur10e or my_arm.urdf. Or write the flange's poses as columns x,y,z,qw,qx,qy,qz."
+            )
         for one in self.numbers:
             try:
                 found += readings(one)
@@ -78,7 +86,7 @@ class Listing:
             changes = (*changes, "inverse")
         if angles not in ("", "deg", "rad"):
             raise DatasetError(f"{option} states the angles in '{angles[:20]}'; use deg or rad.")
-        if not (rotation or angles or changes):
+        if not (rotation or angles or changes) or not self.numbers:
             return self
         numbers = tuple(
             replace(one, rotation=rotation or one.rotation, angles=angles or one.angles, changes=changes)
@@ -91,6 +99,24 @@ class Listing:
             ]
             raise DatasetError(f"'{self.name}' holds {held}, and {option} states {rotation}; correct one of them.")
         return replace(self, numbers=numbers)
+
+    def of_arm(self, arm: str | None) -> "Listing":
+        """Return the list with the flange's poses of an arm where it holds joint angles alone.
+
+        Raises DatasetError where the arm has another number of joints.
+        """
+        if self.numbers or self.joints is None or not arm:
+            return self
+        chain = load_chain(arm)
+        if self.joints.shape[1] != chain.n:
+            raise DatasetError(
+                f"'{self.name}' holds {self.joints.shape[1]} joint angles a row, and {chain.name} has {chain.n} joints:"
+                " name the arm that was moved with --robot."
+            )
+        X = chain_poses(chain, self.joints)
+        form = f"{self.form} with the kinematics of {chain.name}"
+        found = listing_of(self.name, X[:, :3, 3], X[:, :3, :3], unit="m", form=form, ids=self.ids, times=self.times)
+        return replace(found, joints=self.joints)
 
 
 def _fits(numbers: PoseNumbers, rotation: str) -> bool:

@@ -199,6 +199,8 @@ def two_lists(
     Raises:
         DatasetError: a stated name is in none or several lists, or the names do not tell which list is whose.
     """
+    if any(one.numbers and whose(one.name) == "robot" for one in lists):
+        lists = [one for one in lists if one.numbers]  # joint angles beside the robot's poses
     many = [one for one in lists if len(one) > 1]
     if robot is None and camera is None and len(many) > 1:
         lists = many  # a pose alone beside lists is a result
@@ -214,7 +216,7 @@ def two_lists(
     rest = [one for one in lists if one not in chosen.values()]
     for who in ("robot", "camera"):
         if who not in chosen:
-            mine = [one for one in rest if whose(one.name) == who]
+            mine = [one for one in rest if (whose(one.name) if one.numbers else "robot") == who]
             if len(mine) == 1:
                 chosen[who] = mine[0]
     rest = [one for one in lists if one not in chosen.values()]

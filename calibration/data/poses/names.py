@@ -82,6 +82,14 @@ _EULER_WORDS = (
     ("angle1", "angle2", "angle3"),
     ("euler1", "euler2", "euler3"),
 )
+_JOINT = re.compile(r"(?:(.*)[._\s])?(?:q|j|jt|a|ax|axis|achse|joint|theta|th|position)[_\s]?([0-9])(?:_[a-z])?")
+_JOINTS_BY_NAME = (
+    ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
+    ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"),
+    ("s", "l", "u", "r", "b", "t"),
+)
+"""Names of six joints: Universal Robots in ROS and on the pendant, Yaskawa."""
+_FEWEST_JOINTS = 5
 _UNIT = re.compile(r"[\[(]\s*([a-zA-Z°]*)\s*[\])]|[_\s](mm|cm|m|in|inch|deg|rad|degrees|radians|°)$")
 _UNITS = {
     "degrees": "deg",
@@ -185,6 +193,36 @@ class PoseColumn:
     index: int
 
 
+@dataclass(frozen=True)
+class JointColumns:
+    """The columns of a robot's joint angles in the order of the joints: whose, their places, their unit or empty."""
+
+    prefix: str
+    indices: tuple[int, ...]
+    unit: str
+
+
+def joint_columns(header: list[str]) -> list[JointColumns]:
+    """Return the columns of joint angles of a header, for each robot: five or more of numbered or well known names."""
+    plain = [_unit_of(h.strip().lower()) for h in header]
+    groups: dict[str, dict[int, int]] = {}
+    for k, (name, _) in enumerate(plain):
+        if part := _JOINT.fullmatch(name):
+            groups.setdefault(f"{part[1] or ''}/{name[len(part[1] or '') : part.start(2)]}", {})[int(part[2])] = k
+    names = [re.sub(r"_joint|_(deg|rad|position)$", "", name) for name, _ in plain]
+    for words in _JOINTS_BY_NAME:
+        if set(words) <= set(names):
+            groups[f"/{words[0]}"] = {number: names.index(word) for number, word in enumerate(words)}
+    found = []
+    for key, places in groups.items():
+        numbers = sorted(places)
+        if len(numbers) >= _FEWEST_JOINTS and numbers[0] < 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+            units = {plain[k][1] for k in places.values()}
+            unit = units.pop() if len(units) == 1 else ""
+            found.append(JointColumns(key.partition("/")[0], tuple(places[n] for n in numbers), unit))
+    return [one for one in found if not one.prefix.endswith("target")] or found
+
+
 def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
     """Return the columns of poses of a header, and the places of its ids and times.
 
@@ -195,9 +233,10 @@ def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
     found: list[PoseColumn] = []
     other: dict[str, int] = {}
     plain = [_unit_of(h.strip().lower()) for h in header]
-    joints = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
+    joints = {k for one in joint_columns(header) for k in one.indices}
+    arm = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
     for k, (name, unit) in enumerate(plain):
-        if joints and re.fullmatch(r"q[0-9]", name):
+        if k in joints or (arm and re.fullmatch(r"q[0-9]", name)):
             continue
         if name in IDS and "id" not in other:
             other["id"] = k

@@ -37,7 +37,7 @@ it."""
 
 @dataclass(frozen=True, kw_only=True)
 class StatedForms:
-    """What the user states of the two lists: form and name of each, and the unit of lengths of both."""
+    """What the user states of the two lists: form and name of each, the unit of lengths of both, and the robot."""
 
     robot: PoseForm = field(default_factory=PoseForm)
     camera: PoseForm = field(default_factory=PoseForm)
@@ -45,6 +45,7 @@ class StatedForms:
     camera_poses: str | None = None
     unit: str | None = None
     decide: bool = True  # whether the data choose the reading: not where the file holds motions
+    arm: str | None = None  # the robot whose joint angles stand for its poses
     camera_known: bool = False  # whether the camera's poses were computed here, so that their reading is no question
 
 
@@ -68,6 +69,7 @@ class ImportedPairs:
         rows: rows (from 0) of the robot's and of the camera's list that were paired.
         counts: rows of both lists.
         metres: of the robot's unit of length.
+        joints: joint angles rad of all rows of the robot's list, or None.
     """
 
     robot: Array
@@ -78,6 +80,7 @@ class ImportedPairs:
     rows: tuple[Array, Array]
     counts: tuple[int, int]
     metres: float
+    joints: Array | None = None
 
 
 def import_pairs(lists: list[Listing], source: str, mounting: str, stated: StatedForms) -> ImportedPairs:
@@ -95,6 +98,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
             camera's positions.
     """
     robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
+    robot = robot.of_arm(stated.arm)
     robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
     camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
     rows_r, rows_c, how = together(robot, camera)
@@ -154,6 +158,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         rows=(rows_r, rows_c),
         counts=(len(robot), len(camera)),
         metres=units[0][0],
+        joints=robot.joints,
     )
 
 

@@ -189,7 +189,8 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
             f"The names of the lists in '{folder.name}' do not show which one has the robot's poses: {known}. Name it"
             " with --robot-poses."
         )
-    return replace(lists[0], unit=lists[0].unit or unit or "")
+    one = lists[0].of_arm(stated.arm)
+    return replace(one, unit=one.unit or unit or "")
 
 
 def _imported(
