@@ -88,6 +88,8 @@ class Dataset(Recorded):
     one first."""
     angles: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Joint angles, rad, by id and name (q1 ..., second_q1 ...), where the table of poses or pairs has them."""
+    in_order: bool = False
+    """Whether nothing but their order pairs the poses with the clouds."""
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
         """Return the dataset with its poses in another of its readings."""
@@ -267,7 +269,7 @@ def _recognised(
     data = _finished(folder, header, poses, clouds, refused, hashes, (note,))
     rows = {} if found.joints is None else dict(zip(ids, found.joints, strict=True))
     angles = {id: {f"q{k + 1}": float(v) for k, v in enumerate(q)} for id, q in rows.items() if np.isfinite(q).all()}
-    return replace(data, readings=readings, angles=angles)
+    return replace(data, readings=readings, angles=angles, in_order=how.startswith("paired in order"))
 
 
 def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:

@@ -43,7 +43,6 @@ from weldcal.tools.report.render import write_atomic
 
 EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
 
-
 FileArgument = Annotated[
     Path,
     typer.Argument(
@@ -59,7 +58,7 @@ UnitOption = Annotated[
     option(
         "--unit",
         "UNIT",
-        "Unit of all positions: m, mm, cm or inch.",
+        "Unit of all positions: m, mm, cm or inch; inch,mm for robot and camera.",
         show_default="by the robot's reach and the motions",
     ),
 ]

@@ -210,7 +210,7 @@ def import_scans(
             f"'{source.name}' is {data.header.configuration}, and the command states {mounting}. Correct one of them."
         )
     name = flange or data.header.flange
-    if len(data.readings) > 1:
+    if sum(not one.doubted for one in data.readings) > 1 or (name and len(data.readings) > 1):
         if not name:
             raise InputError(
                 "The poses fit several conventions, and only the scans can decide. Name the flange, for example"

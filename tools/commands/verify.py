@@ -91,19 +91,11 @@ def verify(
     scenario: Annotated[
         str | None,
         option(
-            "--scenario",
-            "NAME",
-            "Let the robot of this scenario touch the part that its scanner sees, in place of scans.",
+            "--scenario", "NAME", "In place of scans let this scenario's robot touch the part that its scanner sees."
         ),
     ] = None,
     robot: Annotated[
-        str | None,
-        option(
-            "--robot",
-            "NAME",
-            "With --scenario: simulated, emulated or a controller's address; else the arm of joint angles.",
-            show_default="with --scenario simulated",
-        ),
+        str | None, option("--robot", "NAME", "The arm of joint angles; with --scenario: simulated or an address ...")
     ] = None,
     points: Annotated[int, option("--points", "N", "With --scenario: places to touch.", min=3, max=60)] = 8,
     flange: FlangeOption = None,
@@ -221,7 +213,8 @@ def verify_dataset(
     in the base, after the result's scanner correction. A scan in which no flange is found is named and not used.
     Without ``correct_scanner`` the result's correction is not applied. ``flange`` overrides dataset.yaml; the fits
     follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what the calibration
-    states. ``pose`` names the pose in a file of several, ``robot`` the arm of joint angles. Nothing is written unless at least one scan can be used.
+    states. ``pose`` names the pose in a file of several.
+    ``robot`` is the arm of joint angles. Nothing is written unless at least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.

@@ -30,7 +30,7 @@ class Listing:
         unit: the unit of length that the file states, or empty.
         form: a phrase for the reader, such as "UR pose vectors".
         left_out: rows (from 0) that hold no pose, with the reason.
-        joints: joint angles (n, joints) rad of the robot, or None; without ``numbers`` they stand for the poses.
+        joints: joint angles (n, joints) rad, or None; without ``numbers`` they stand for the poses.
     """
 
     name: str
@@ -100,6 +100,13 @@ class Listing:
             raise DatasetError(f"'{self.name}' holds {held}, and {option} states {rotation}; correct one of them.")
         return replace(self, numbers=numbers)
 
+    def row(self, k: int) -> "Listing":
+        """Return the list of one row alone, named after it."""
+        numbers = tuple(replace(one, p=one.p[k : k + 1], r=one.r[k : k + 1]) for one in self.numbers)
+        left_out = tuple((0, why) for row, why in self.left_out if row == k)
+        name = f"{self.name.partition(',')[0]}, {self.ids[k]}"
+        return replace(self, name=name, numbers=numbers, ids=(self.ids[k],), times=None, left_out=left_out, joints=None)
+
     def of_arm(self, arm: str | None) -> "Listing":
         """Return the list with the flange's poses of an arm where it holds joint angles alone.
 
@@ -133,6 +140,7 @@ def listing_of(
     angles: str = "",
     usual: str = "",
     vector: bool = True,
+    firm: bool = False,
     **more: object,
 ) -> Listing:
     """A list of positions (n, 3) and rotations (n, 3), (n, 4) or (n, 3, 3); rows without a pose are found and replaced.
@@ -140,9 +148,10 @@ def listing_of(
     Raises:
         DatasetError: no row holds a pose, or a number is too large.
     """
-    return _listing(
+    found = _listing(
         name, [(np.asarray(p, dtype=float), np.asarray(r, dtype=float))], rotation, angles, usual, vector, **more
     )
+    return replace(found, numbers=tuple(replace(one, firm=firm) for one in found.numbers)) if firm else found
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
@@ -174,8 +183,9 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
     times = next((t for kind, _, _, t in found if kind == least and t is not None), None)
     if times is not None and more.get("times") is None:
         more["times"] = times
+    whole = v.size % 16 == 0 and v.shape[-1] in (4, 16) and not v.reshape(-1, 16)[:, 12:].any()
     form = {
-        _MATRIX: "4 x 4 matrices",
+        _MATRIX: "4 x 4 matrices" + (" whose last row 0, 0, 0, 0 is taken as 0, 0, 0, 1" if whole else ""),
         _QUATERNION: "x, y, z, quaternion",
         _VECTOR: "x, y, z and three numbers of a rotation",
     }[least]
@@ -241,6 +251,8 @@ def _of_matrices(M: Array) -> Iterator[tuple[int, Array, Array, None]]:
     filled = M[np.isfinite(M).all(axis=(1, 2)) & (np.abs(M[:, :3, :3]).max(axis=(1, 2)) > 0.0)]
     if M.shape[1:] == (4, 4) and len(filled):
         last = np.array([0.0, 0.0, 0.0, 1.0])
+        if not filled[:, 3].any():  # np.zeros((4, 4)) whose last row was forgotten
+            last = np.zeros(4)
         if not (np.abs(filled[:, 3] - last) <= 1e-6).all():
             if not (np.abs(filled[:, :, 3] - last) <= 1e-6).all():
                 return

@@ -54,7 +54,7 @@ _POSITION = {
     "linear",
     "coord",
 }
-_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
+_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad", "theta"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
@@ -75,6 +75,7 @@ _OWNERS = (
 )
 _WHOLE = {
     "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
+    "e", "u", "v", "ez", "ey", "ex", "n1", "n2", "n3", "ox", "oy", "oz",
 }  # fmt: skip
 _EULER_WORDS = (
     ("alpha", "beta", "gamma"),
@@ -227,8 +228,7 @@ def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
     """Return the columns of poses of a header, and the places of its ids and times.
 
     Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
-    for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to
-    m33.
+    for sure); roll, pitch, yaw; e1, e2, e3 (other angles); m00 to m33; letters of a maker, see `text`.
     """
     found: list[PoseColumn] = []
     other: dict[str, int] = {}
@@ -249,6 +249,16 @@ def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
             found.append(PoseColumn(prefix, role, unit, k))
             break
     return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
+
+
+def distinct(header: list[str]) -> list[str]:
+    """Return a header whose Y after R and P (Nachi: turns about z, y and x) has a name other than the position's."""
+    plain = [_unit_of(h.strip().lower())[0] for h in header]
+    at = next((k for k in range(3, len(plain) - 2) if plain[k : k + 3] == ["r", "p", "y"] and "y" in plain[:k]), None)
+    if at is None:
+        return header
+    turned = [f"n{k + 1}{header[at + k].strip()[1:]}" for k in range(3)]
+    return [*header[:at], *turned, *header[at + 3 :]]
 
 
 def _is_t_of_oat(name: str, names: list[str]) -> bool:
@@ -275,9 +285,13 @@ def _roles(name: str) -> list[tuple[str, str]]:
     if not tokens:
         return []
     last, before = tokens[-1], tokens[:-1]
+    if before[-1:] == ["o"] and last in ("x", "y", "z"):
+        return [(_prefix(before[:-1]), f"o{last}")]  # the axis of an orientation vector (viam)
+    if last in ("th", "theta"):
+        return [(_prefix(before), "th")]
     if last in ("a", "b", "c", "w", "p", "r", "o") and len(before) == 1 and before[0] in _OWNERS:
         return [(before[0], last)]
-    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
+    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv|theta)([wxyz])", last):
         before, last = [*before, short[1]], short[2]
     if (short := re.fullmatch(r"(.+?)([xyz]|q[wxyz]|r[xyz])", last)) and short[1] in _OWNERS:
         before, last = [*before, short[1]], short[2]

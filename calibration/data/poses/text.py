@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.names import JointColumns, PoseColumn, columns_of, joint_columns, whose
+from weldcal.calibration.data.poses.names import JointColumns, PoseColumn, columns_of, distinct, joint_columns, whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -27,6 +27,9 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
+_ARRAY = re.compile(r"\b(?:np\.|numpy\.)?(?:array|matrix)\s*\(")
+_NAMED_ARRAY = re.compile(r"(?m)^[ \t]*[A-Za-z_]\w{0,40}[ \t]*=[ \t]*(?=\[\[)")
+"""What stands before the numbers of an array that was pasted from Python."""
 _SECONDS = 1e8  # a choice: a first column from here on counts seconds since 1970, and below it rows
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
 _TURN_RAD = 7.0  # a whole turn and a little: larger joint angles are degrees
@@ -41,9 +44,13 @@ _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("vx vy vz", {"rotation": "rotation_vector", "form": "x, y, z, rotation vector"}),
     ("rx ry rz", {"form": "x, y, z, rx, ry, rz"}),
     ("roll pitch yaw", {"usual": "euler_xyz", "vector": False, "form": "x, y, z, roll, pitch, yaw"}),
-    ("a b c", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, KUKA A, B, C"}),
+    ("a b c", {"usual": "euler_ZYX", "firm": True, "vector": False, "angles": "deg", "form": "x, y, z, A, B, C"}),
     ("w p r", {"rotation": "euler_xyz", "angles": "deg", "form": "x, y, z, Fanuc W, P, R"}),
     ("o a t", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, O, A, T"}),
+    ("a e r", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, Comau A, E, R"}),
+    ("u v w", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, Epson U, V, W"}),
+    ("ez ey ex", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, ABB EZ, EY, EX"}),
+    ("n1 n2 n3", {"usual": "euler_ZYX", "vector": False, "angles": "deg", "form": "x, y, z, Nachi R, P, Y"}),
     ("e1 e2 e3", {"vector": False, "form": "x, y, z and three angles"}),
 )
 """The columns of a rotation, and what they say of it, in the order in which they are sought."""
@@ -61,16 +68,19 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
     """
     text = text.lstrip("\ufeff")
     require_short_numbers(text, name)
+    text = _ARRAY.sub("", text)
+    if len(_NAMED_ARRAY.findall(text)) == 1:
+        text = _NAMED_ARRAY.sub("", text)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
             f"'{name}' is COLMAP's images.txt, whose poses are inverted (world in camera) and have no unit of length."
             " Invert them, scale them to metres by a known length, and write them as a table x,y,z,qw,qx,qy,qz."
         )
     found = list_of_program(text, name)
-    return [found] if found is not None else _keyed(text, name) or _numbers(text, name)
+    return [found] if found is not None else keyed_lists(text, name) or _numbers(text, name)
 
 
-def _keyed(text: str, name: str) -> list[Listing]:
+def keyed_lists(text: str, name: str) -> list[Listing]:
     """Return the lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each.
 
     Empty where it has none.
@@ -161,8 +171,9 @@ def _whole_header(lines: list[_Line], at: int) -> tuple[list[str], list[_Line]]:
     """The names of a header of one or two lines with the units of a line below it, and the lines below."""
     names, rest = list(lines[at].cells), lines[at + 1 :]
     above = lines[at - 1].cells if at else []
-    if len({n.lower() for n in names}) < len(names) and 1 < len(above) <= len(names) and not _filled(lines[at - 1]):
+    if len({n.lower() for n in names}) < len(names) and 1 < len(above) <= len(names) + 1 and not _filled(lines[at - 1]):
         owner, joined = "", []
+        names += [""] * (len(above) - len(names))
         for k, name in enumerate(names):
             owner = above[k] if k < len(above) and above[k] else owner
             joined.append(f"{owner} {name}".strip())
@@ -300,6 +311,7 @@ def _named(header: Sequence[str]) -> int:
 
 
 def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
+    header = distinct(header)
     _, other = columns_of(header)
     again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
     if again is not None:
@@ -409,6 +421,12 @@ def _columns(name: str, columns: list[PoseColumn], table: Array, ids: tuple[str,
     if not {"x", "y", "z"} <= set(at):
         raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
     p = take("x", "y", "z")
+    if {"ox", "oy", "oz", "th"} <= set(at):
+        o, th = take("ox", "oy", "oz"), np.radians(take("th"))
+        o = o / np.linalg.norm(o, axis=1, keepdims=True)
+        turns = np.column_stack([np.arctan2(o[:, 1], o[:, 0]), np.arccos(np.clip(o[:, 2], -1.0, 1.0)), th[:, 0]])
+        more["form"] = "x, y, z, orientation vector"
+        return listing_of(name, p, turns, rotation="euler_ZYZ", angles="rad", **more)
     for words, stated in _ROTATIONS:
         roles = words.split()
         if set(roles) <= set(at) and not (words in _NUMBERED and {"rx", "ry", "rz"} <= set(at)):

@@ -13,7 +13,7 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import folder_lists, read_lists
+from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
@@ -98,8 +98,8 @@ def read_pairs(
     if path.is_dir() and (path / "pairs.npz").exists():
         path = path / "pairs.npz"
     mounting = None if mounting is None else mounting_name(mounting)
-    if length is not None and length not in LENGTHS:
-        raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
+    if length is not None and (length.count(",") > 1 or not set(length.split(",")) <= set(LENGTHS)):
+        raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}, or inch,mm for robot and camera.")
     try:
         return _pairs(path, *_contents(path), mounting, length, stated or StatedForms())
     except (DatasetError, InconsistentPoses):
@@ -208,10 +208,7 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
             " folder."
         )
     if ending in (".pkl", ".pickle"):
-        raise DatasetError(
-            f"'{path.name}' is a pickle, which may run code: save the two arrays with numpy.savez(file, robot=...,"
-            " camera=...)."
-        )
+        raise DatasetError(PICKLED.format(path.name))
     if ending == ".npz":
         arrays = read_npz(path)
         if "hand" in arrays and "eye" in arrays:
