@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.clouds import CloudError
@@ -20,7 +19,7 @@ from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.geometry.ordering import OrderFit, find_order
+from weldcal.calibration.geometry.ordering import OrderFit, Rows, find_order
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import nearest_rotation
 from weldcal.models.arrays import Array
@@ -128,7 +127,7 @@ def _in_found_order(data: Dataset, observations: list[Observation]) -> Dataset:
     if any(_agreement(one, present, p_CR, n_C, X_FR, False).agrees for one in every):
         return data
 
-    def solve(_: int, __: int, pairs: tuple[NDArray[np.int64], NDArray[np.int64]]) -> OrderFit:
+    def solve(_: int, __: int, pairs: tuple[Rows, Rows]) -> OrderFit:
         tried = [_agreement(one, pairs[0], p_CR[pairs[1]], n_C[pairs[1]], X_FR, False) for one in every]
         one = min(tried, key=_cost)
         X = one.reading.X @ X_FR
@@ -242,7 +241,7 @@ class ScanAgreement:
 
 
 def choose_reading(
-    readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
+    readings: Sequence[PoseReading], rows: Rows, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
     """Return the reading of the flange poses with which the scans agree, and a sentence about it.
 
@@ -333,7 +332,7 @@ def _same(one: ScanAgreement, other: ScanAgreement) -> bool:
     )
 
 
-def _agreement(reading: PoseReading, rows: Array, p_CR: Array, n_C: Array, X_FR: Array, changed: bool) -> ScanAgreement:
+def _agreement(reading: PoseReading, rows: Rows, p_CR: Array, n_C: Array, X_FR: Array, changed: bool) -> ScanAgreement:
     X = reading.X[rows] @ X_FR
     p_B, n_B = X[:, :3, 3], X[:, :3, 2]
     n = len(rows)

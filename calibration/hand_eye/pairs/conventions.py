@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
-from weldcal.calibration.geometry.ordering import FoundOrder, OrderFit, find_order
+from weldcal.calibration.geometry.ordering import FoundOrder, OrderFit, Rows, find_order
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import angle_of, exp_rotation, inverse, log_rotation, nearest_rotation
 from weldcal.models.arrays import Array
@@ -276,7 +276,7 @@ def order_of(robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye
     """
     F = [one.X if eye_in_hand else inverse(one.X) for one in robot]
 
-    def solve(a: int, b: int, pairs: tuple[NDArray[np.int64], NDArray[np.int64]]) -> OrderFit:
+    def solve(a: int, b: int, pairs: tuple[Rows, Rows]) -> OrderFit:
         some = [(pick([robot[a]], pairs[0])[0], pick([camera[b]], pairs[1])[0], 0)]
         (one,) = agreements(some, eye_in_hand=eye_in_hand)
         X, Y, scale, G = one.X, one.Y, one.scale if one.unit_scale is None else one.unit_scale, camera[b].X

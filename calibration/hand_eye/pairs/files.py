@@ -13,7 +13,7 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists
+from weldcal.calibration.data.poses.lists import ENDINGS, PICKLED, folder_lists, read_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
@@ -274,8 +274,10 @@ def _no_lists(folder: Path) -> str:
             " into camera01.yaml ... (4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use"
             " weldcal calibrate."
         )
+    unknown = sorted({Path(n).suffix for n in names if Path(n).suffix.lower() not in ENDINGS})
+    also = f" Files {', '.join(unknown[:4])} are not read." if unknown else ""
     return (
-        f"'{folder.name}' holds no poses: give robot.csv and camera.csv, folders robot/ and camera/ with one file per"
+        f"'{folder.name}' holds no poses.{also} Give robot.csv and camera.csv, folders robot/ and camera/ with one file per"
         " pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
     )
 

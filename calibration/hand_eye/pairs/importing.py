@@ -6,6 +6,7 @@ Find the two lists, pair their rows, and let the data choose how they are read.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.geometry.ordering import Rows
 from weldcal.calibration.geometry.se3 import scaled
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide, order_of
 from weldcal.models.arrays import Array
@@ -79,7 +81,7 @@ class ImportedPairs:
     reading: Mapping[str, Mapping[str, object]]
     notes: tuple[str, ...]
     ids: tuple[str, ...]
-    rows: tuple[Array, Array]
+    rows: tuple[Rows, Rows]
     counts: tuple[int, int]
     metres: float
     joints: Array | None = None
@@ -202,9 +204,7 @@ def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading
     return found
 
 
-def _ordered(
-    robot: Listing, camera: Listing, mounting: str, *, sure: bool = True
-) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+def _ordered(robot: Listing, camera: Listing, mounting: str, *, sure: bool = True) -> tuple[Rows, Rows] | None:
     """Rows of both lists that belong together by the angles of their motions; None where no order agrees.
 
     Raises InconsistentPoses where some rows may have several partners, if ``sure``.
@@ -223,7 +223,7 @@ def _ordered(
     return good[0][found.first], good[1][found.second]
 
 
-def order_words(robot: Listing, camera: Listing, rows_r: Array, rows_c: Array) -> str:
+def order_words(robot: Listing, camera: Listing, rows_r: Rows, rows_c: Rows) -> str:
     """Say in which order two lists belong together, and which rows have no partner."""
     said = ""
     moved = [(r, c) for r, c in zip(rows_r.tolist(), rows_c.tolist(), strict=True)]
@@ -247,7 +247,7 @@ def _row(listing: Listing, row: int) -> str:
     return listing.ids[row] if listing.ids else str(row + 1)
 
 
-def _rows(listing: Listing, rows: Array) -> str:
+def _rows(listing: Listing, rows: NDArray[np.integer[Any]]) -> str:
     return f"row{'s' if len(rows) > 1 else ''} {', '.join(_row(listing, int(k)) for k in rows)}"
 
 
