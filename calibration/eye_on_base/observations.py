@@ -19,8 +19,7 @@ from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.geometry.ordering import OrderFit, Rows, find_order
-from weldcal.calibration.geometry.robust import f_quantile
+from weldcal.calibration.geometry.robust import OrderFit, Rows, f_quantile, find_order
 from weldcal.calibration.geometry.se3 import nearest_rotation
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard

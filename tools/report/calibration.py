@@ -147,7 +147,8 @@ class CalibrationReport:
         expected, figure = work_point_expected(work)
         tolerance = limit_tolerance("error at the work point, 95 %", figure, self.limit_mm)
         corrected = correction_note(r, self.out / RESULT_FILE)
-        notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        moved = [text for text in self.notes if "in another order" in text]
+        notes = [*filter(None, (corrected,)), *moved, *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         n, left = len(r.poses), len(self.refused)
         lead = f"{n - left} of {n} scans are used." if left else ""

@@ -56,7 +56,7 @@ class Listing:
         problem: DatasetError | None = None
         if not self.numbers:
             raise DatasetError(
-                f"'{self.name}' holds joint angles and no poses: name the arm by --robot or in dataset.yaml, for example"
+                f"'{self.name}' holds joint angles and no poses: name the arm by --robot or in dataset.yaml, such as"
                 " ur10e or my_arm.urdf. Or write the flange's poses as columns x,y,z,qw,qx,qy,qz."
             )
         for one in self.numbers:

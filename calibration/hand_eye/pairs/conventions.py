@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
-from weldcal.calibration.geometry.ordering import FoundOrder, OrderFit, Rows, find_order
-from weldcal.calibration.geometry.robust import f_quantile
+from weldcal.calibration.geometry.robust import FoundOrder, OrderFit, Rows, f_quantile, find_order
 from weldcal.calibration.geometry.se3 import angle_of, exp_rotation, inverse, log_rotation, nearest_rotation
 from weldcal.models.arrays import Array
 

@@ -277,8 +277,8 @@ def _no_lists(folder: Path) -> str:
     unknown = sorted({Path(n).suffix for n in names if Path(n).suffix.lower() not in ENDINGS})
     also = f" Files {', '.join(unknown[:4])} are not read." if unknown else ""
     return (
-        f"'{folder.name}' holds no poses.{also} Give robot.csv and camera.csv, folders robot/ and camera/ with one file per"
-        " pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
+        f"'{folder.name}' holds no poses.{also} Give robot.csv and camera.csv, folders robot/ and camera/ with one file"
+        " per pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
     )
 
 

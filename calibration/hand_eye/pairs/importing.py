@@ -16,7 +16,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.geometry.ordering import Rows
+from weldcal.calibration.geometry.robust import Rows
 from weldcal.calibration.geometry.se3 import scaled
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide, order_of
 from weldcal.models.arrays import Array
