@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.unsorted_sets import judged, unsorted_set
 from weldcal.calibration.data.poses.listing import listing_of_array
+from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.calibration.hand_eye.pairs import conventions
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, import_pairs
 from weldcal.models.arrays import Array
 
@@ -91,3 +93,13 @@ def test_a_list_in_order_is_not_touched() -> None:
     found = paired(ROBOT, CAMERA)
     assert rows(found) == [(k, k) for k in range(N)]
     assert not any("order" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("eye_in_hand", [True, False])
+def test_the_angles_of_motions_are_the_same_in_both_lists(eye_in_hand: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Array] = []
+    monkeypatch.setattr(conventions, "find_order", lambda ours, theirs, *_: given.extend([ours[0], theirs[0]]))
+    robot = ROBOT if eye_in_hand else inverse(ROBOT)
+    conventions.order_of([PoseReading("", "", robot)], [PoseReading("", "", CAMERA)], eye_in_hand=eye_in_hand)
+    assert given[0] == pytest.approx(given[1], abs=1e-6)
+    assert given[0].max() > 1.0
