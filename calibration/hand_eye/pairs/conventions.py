@@ -291,11 +291,12 @@ def order_of(robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye
             agrees=one.agrees,
         )
 
-    return find_order([_all_angles(X) for X in F], [_all_angles(inverse(one.X)) for one in camera], solve, robot[0].X)
+    angles = [[_all_angles(one.X) for one in listed] for listed in (robot, camera)]
+    return find_order(*angles, solve, robot[0].X)
 
 
 def _all_angles(X: Array) -> Array:
-    """Angles (n, n) rad of the motions between poses."""
+    """Angles (n, n) rad of the motions between poses: the same from either side."""
     R = X[:, :3, :3]
     return angle_of(np.einsum("aji,bjk->abik", R, R, optimize=True))
 
