@@ -253,6 +253,8 @@ def two_lists(
 def without_copies(lists: list[Listing]) -> list[Listing]:
     """Return the lists of poses without those that hold the numbers of another one, in any form."""
     kept: list[Listing] = []
+    if len(lists) < 2:
+        return lists
     for one in sorted((one for one in lists if one.numbers), key=lambda one: len(one.readings)):
         if not any(len(other) == len(one) and _alike(other, one) for other in kept):
             kept.append(one)

@@ -77,6 +77,8 @@ _WHOLE = {
     "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
     "e", "u", "v", "ez", "ey", "ex", "n1", "n2", "n3", "ox", "oy", "oz",
 }  # fmt: skip
+_WHOLE_ONLY = (("w", "u", "v"), ("a", "r", "e", "e"), ("ox", "oy", "oz", "th", "th"))
+"""Letters of makers whose last two mean nothing without the others: pixels, errors and angles have such names, too."""
 _EULER_WORDS = (
     ("alpha", "beta", "gamma"),
     ("phi", "theta", "psi"),
@@ -248,6 +250,9 @@ def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
         for prefix, role in _roles(name):
             found.append(PoseColumn(prefix, role, unit, k))
             break
+    roles = {c.role for c in found}
+    alone = {role for whole in _WHOLE_ONLY if not set(whole) <= roles for role in whole[-2:]}
+    found = [c for c in found if c.role not in alone]
     return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
 
 

@@ -10,7 +10,7 @@ import pytest
 from tests.calibration.data.pose_texts import MATRICES, TEXTS, N, P, Q
 from weldcal.calibration.data.clouds import save_cloud
 from weldcal.calibration.data.dataset import joint_angles, load_dataset
-from weldcal.calibration.data.poses.names import joint_columns
+from weldcal.calibration.data.poses.names import columns_of, joint_columns
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
@@ -131,3 +131,9 @@ def test_pairs_take_the_robots_poses_from_joint_angles(tmp_path: Path) -> None:
     assert found.q == pytest.approx(ANGLES, abs=1e-6)
     with pytest.raises(InputError, match="no arm 'ur99'"):
         read_pairs(tmp_path, mounting="eye_in_hand", stated=StatedForms(arm="ur99"))
+
+
+@pytest.mark.parametrize("header", ["x,y,z,qx,qy,qz,qw,u,v", "x,y,z,rx,ry,rz,e,theta", "u,v,x,z"])
+def test_pixels_and_errors_are_no_part_of_a_pose(header: str) -> None:
+    names = header.split(",")
+    assert not {c.role for c in columns_of(names)[0]} & {"u", "v", "e", "th"}
