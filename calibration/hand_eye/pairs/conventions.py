@@ -291,8 +291,8 @@ def order_of(robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye
             agrees=one.agrees,
         )
 
-    angles = [[_all_angles(one.X) for one in listed] for listed in (robot, camera)]
-    return find_order(*angles, solve, robot[0].X)
+    ours, theirs = ([_all_angles(one.X) for one in listed] for listed in (robot, camera))
+    return find_order(ours, theirs, solve, robot[0].X)
 
 
 def _all_angles(X: Array) -> Array:
