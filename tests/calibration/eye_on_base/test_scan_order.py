@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.clouds import save_cloud
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.eye_on_base.observations import _in_found_order
+from weldcal.calibration.eye_on_base.observations import _in_found_order, _read_by_scans
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arrays import Array
@@ -79,3 +79,19 @@ def test_scans_that_fit_two_poses_are_refused_by_row(tmp_path: Path) -> None:
     order[order.index(6)] = 2  # two scans of the same place
     with pytest.raises(InconsistentPoses, match=r"order of all poses but 3, 7\. Add a column 'id'"):
         _in_found_order(data, observations(data, order))
+
+
+@pytest.mark.parametrize(
+    ("axes", "form"), [("ZYX", "euler_ZYX,deg"), ("ZYZ", "euler_ZYZ,deg"), ("xyz", "euler_xyz,deg")]
+)
+def test_letters_a_b_c_are_of_another_maker_where_the_scans_say_so(tmp_path: Path, axes: str, form: str) -> None:
+    angles = Rotation.from_matrix(X_BF[:, :3, :3]).as_euler(axes, degrees=True)
+    rows = [",".join(f"{v:.6f}" for v in (*(1e3 * X[:3, 3]), *r)) for X, r in zip(X_BF, angles, strict=True)]
+    (tmp_path / "poses.csv").write_text("\n".join(["x,y,z,a,b,c", *rows]) + "\n")
+    for k in range(N):
+        save_cloud(tmp_path / "clouds" / f"s{k:02d}.npz", np.random.default_rng(k).uniform(0.5, 1.0, (50, 3)))
+    data = load_dataset(tmp_path)
+    assert data.readings[0].form == "euler_ZYX,deg"
+    found = _read_by_scans(data, observations(data, list(range(N))))
+    assert found.readings[0].form == form
+    assert pytest.approx(X_BF, abs=1e-7) == found.readings[0].X

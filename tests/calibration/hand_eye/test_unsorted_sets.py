@@ -40,7 +40,7 @@ def test_of_seventy_generated_sets_none_is_accepted_wrong() -> None:
     counts = Counter((one.determined, judged(one)[0]) for one in sets)
     assert counts[True, "WRONG"] + counts[False, "WRONG"] == 0
     determined = sum(count for (sure, _), count in counts.items() if sure)
-    assert determined > 30
+    assert determined > 25
     assert counts[True, "right"] >= 0.97 * determined
 
 
