@@ -33,7 +33,10 @@ from weldcal.models.files import (
 )
 
 Row = dict[str, str]
+Angles = dict[str, dict[str, float]]
 
+JOINT_NAME = re.compile(r"(second_)?q[1-7]")
+"""Columns of joint angles, rad, in this package's own tables."""
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -389,6 +392,15 @@ def row_numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> li
             raise DatasetError(f"'{path.name}' has {row[c]} in column {c} of '{row['id']}', beyond {LARGEST_NUMBER:g}.")
         out.append(value)
     return out
+
+
+def row_angles(rows: list[Row], path: Path) -> Angles:
+    """Joint angles q1 ... and second_q1 ... rad by id and name. Raises DatasetError for a cell that is no number."""
+    names = [name for name in rows[0] if JOINT_NAME.fullmatch(name)]
+    given = {row["id"]: tuple(name for name in names if row[name]) for row in rows}
+    return {
+        row["id"]: dict(zip(given[row["id"]], row_numbers(row, given[row["id"]], path), strict=True)) for row in rows
+    }
 
 
 def unit_quaternion(wxyz: list[float], where: str) -> RotationMatrix:

@@ -17,12 +17,14 @@ from weldcal.calibration.data.checks import (
     CONFIGURATIONS,
     REACH_M,
     UNITS,
+    Angles,
     Recorded,
     check_reach,
     cloud_form,
     digest,
     metric_cloud,
     read_header,
+    row_angles,
     row_numbers,
     table_rows,
     to_metres,
@@ -84,6 +86,10 @@ class Dataset(Recorded):
     readings: tuple[PoseReading, ...] = ()
     """Readings of the poses, in metres and in the order of ``poses``, where their file allows more than one; the used
     one first."""
+    angles: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Joint angles, rad, by id and name (q1 ..., second_q1 ...), where the table of poses or pairs has them."""
+    in_order: bool = False
+    """Whether nothing but their order pairs the poses with the clouds."""
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
         """Return the dataset with its poses in another of its readings."""
@@ -121,21 +127,17 @@ class Dataset(Recorded):
         return None if X_BC is None else X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
 
     def joints(self, names: tuple[str, ...] = JOINTS) -> dict[str, Array]:
-        """Joint angles (6,) rad by id, of poses.csv; empty where it has none.
+        """Joint angles (6,) rad by id; empty where the table of the poses has none.
 
-        Raises DatasetError for bad or missing numbers.
+        Raises DatasetError for missing numbers.
         """
-        path = self.folder / "poses.csv"
-        rows = table_rows(path, ("id",)) if path.is_file() else []
-        missing = [(row["id"], name) for row in rows for name in names if not row.get(name)]
-        if missing and len(missing) < len(rows) * len(names):
+        missing = [(id, name) for id, q in self.angles.items() for name in names if name not in q]
+        if missing and len(missing) < len(self.angles) * len(names):
             raise DatasetError(
-                f"{path} has no {missing[0][1]} of '{missing[0][0]}', although it has other joint angles. "
-                f"Add it, or remove the columns {names[0]} to {names[-1]}."
+                f"'{self.folder.name}' has no {missing[0][1]} of '{missing[0][0]}', although it has other joint angles."
+                f" Add it, or remove the columns {names[0]} to {names[-1]}."
             )
-        if missing:
-            return {}
-        return {row["id"]: np.array(row_numbers(row, names, path)) for row in rows}
+        return {} if missing else {id: np.array([q[name] for name in names]) for id, q in self.angles.items()}
 
     def cloud(self, id: str) -> Array:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
@@ -198,12 +200,13 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
     if source is None and (folder / "pairs.csv").is_file():
         hashes["pairs.csv"] = digest(folder / "pairs.csv")
         scales = (UNITS.get(header.units.poses, 1.0), UNITS.get(header.units.clouds, 1.0))
-        pairs = _pairs(folder / "pairs.csv", *scales)
+        pairs, angles = _pairs(folder / "pairs.csv", *scales)
         again = _repeated({p.id: (*p.X_BR.GetAsMatrix34().ravel(), *p.p_CR) for p in pairs})
         pairs = tuple(p for p in pairs if p.id not in dict(again))
-        return Dataset(folder=folder, header=header, poses={}, clouds={}, pairs=pairs, refused=again, hashes=hashes)
+        bare_set = Dataset(folder=folder, header=header, poses={}, clouds={}, pairs=pairs, refused=again, hashes=hashes)
+        return replace(bare_set, angles=angles)
     if source is not None:
-        return _recognised(folder, header, source, hashes)
+        return _recognised(folder, header, source, hashes, robot or header.robot)
     if bag is not None:
         return _recording(folder, header, bag, hashes, robot)
     if (folder / "stream.csv").is_file():
@@ -218,18 +221,10 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
 
 
 def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None:
-    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none.
-
-    Raises DatasetError for bad numbers.
-    """
-    path = data.folder / ("pairs.csv" if data.pairs else "poses.csv")
-    if not path.is_file():
-        return None  # another form of poses
+    """Joint angles (n, joints) rad at the poses of these ids; None where their table has none."""
     names = tuple(f"q{i + 1}" for i in range(joints))
-    rows = {row["id"]: row for row in table_rows(path, ("id",))}
-    if not all(rows.get(id, {}).get(name) for id in ids for name in names):
-        return None
-    return np.array([row_numbers(rows[id], names, path) for id in ids])
+    rows = [data.angles.get(id, {}) for id in ids]
+    return np.array([[q[name] for name in names] for q in rows]) if all(set(names) <= set(q) for q in rows) else None
 
 
 def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
@@ -247,17 +242,17 @@ def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
 def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Dataset:
     """Return a dataset in this package's own form: poses.csv with quaternions, and clouds/."""
     hashes["poses.csv"] = digest(folder / "poses.csv")
-    poses = _poses(folder / "poses.csv", header.units.poses)
+    poses, angles = _poses(folder / "poses.csv", header.units.poses)
     clouds, refused = _match(folder / "clouds", poses)
-    return _finished(folder, header, poses, clouds, refused, hashes, ())
+    return replace(_finished(folder, header, poses, clouds, refused, hashes, ()), angles=angles)
 
 
 def _recognised(
-    folder: Path, header: DatasetHeader, source: Path | tuple[Path, ...], hashes: dict[str, str]
+    folder: Path, header: DatasetHeader, source: Path | tuple[Path, ...], hashes: dict[str, str], arm: str
 ) -> Dataset:
     """Return a dataset whose poses are in another form."""
     form = header.poses or PoseForm()
-    found = read_poses(source, form)
+    found = read_poses(source, form, arm)
     X, unit = metric_poses(found, header.units.poses, form)
     ids, files, how = pair(found.ids, len(X), find_clouds(folder, source), found.source)
     check_reach(X[:, :3, 3], Path(found.source), unit)
@@ -272,7 +267,9 @@ def _recognised(
         replace(one, X=metric_poses(replace(found, X=one.X), header.units.poses, form)[0]) for one in found.readings
     )
     data = _finished(folder, header, poses, clouds, refused, hashes, (note,))
-    return replace(data, readings=readings)
+    rows = {} if found.joints is None else dict(zip(ids, found.joints, strict=True))
+    angles = {id: {f"q{k + 1}": float(v) for k, v in enumerate(q)} for id, q in rows.items() if np.isfinite(q).all()}
+    return replace(data, readings=readings, angles=angles, in_order=how.startswith("paired in order"))
 
 
 def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:
@@ -398,25 +395,28 @@ def _wxyz(X: RigidTransform) -> list[float]:
     return [float(v) for v in (q.w(), q.x(), q.y(), q.z())]
 
 
-def _poses(path: Path, unit: str) -> dict[str, RigidTransform]:
+def _poses(path: Path, unit: str) -> tuple[dict[str, RigidTransform], Angles]:
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    rows = {row["id"]: row_numbers(row, columns, path) for row in table_rows(path, ("id", *columns))}
+    table = table_rows(path, ("id", *columns))
+    rows = {row["id"]: row_numbers(row, columns, path) for row in table}
     p = np.array([v[:3] for v in rows.values()])
     if unit == AUTO:
         unit = "mm" if float(np.median(np.linalg.norm(p, axis=1))) > REACH_M[1] else "m"
     scale = UNITS[unit]
     check_reach(scale * p, path, unit)
-    return {id: RigidTransform(unit_quaternion(v[3:], id), scale * np.array(v[:3])) for id, v in rows.items()}
+    poses = {id: RigidTransform(unit_quaternion(v[3:], id), scale * np.array(v[:3])) for id, v in rows.items()}
+    return poses, row_angles(table, path)
 
 
-def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ...]:
+def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[tuple[Pair, ...], Angles]:
     base, camera, turn = (
         tuple(f"base_{c}" for c in "xyz"),
         tuple(f"camera_{c}" for c in "xyz"),
         tuple(f"base_q{c}" for c in "wxyz"),
     )
     pairs = []
-    for row in table_rows(path, ("id", *base, *camera)):
+    table = table_rows(path, ("id", *base, *camera))
+    for row in table:
         v = row_numbers(row, base + camera, path)
         given = [c for c in turn if row.get(c)]
         if given and len(given) < len(turn):
@@ -445,7 +445,7 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
             f"in millimetres: correct units in dataset.yaml to '{cure}'."
         )
     check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
-    return tuple(pairs)
+    return tuple(pairs), row_angles(table, path)
 
 
 def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Path], tuple[tuple[str, str], ...]]:

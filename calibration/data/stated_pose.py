@@ -14,11 +14,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.lists import ARRAYS, TREES, read_lists
+from weldcal.calibration.data.poses.lists import ARRAYS, TREES, lists_of_file, read_lists
 from weldcal.calibration.data.poses.names import MOUNTINGS, last_key, mounting_name
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
-from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.results import RESULT_FILE as CALIBRATION_FILE
 from weldcal.calibration.errors import DatasetError
@@ -31,6 +30,7 @@ SYMBOLS = {"eye_in_hand": "X_FC", "eye_on_base": "X_BC"}
 """The camera's pose by the mounting."""
 UNITS = {"m": 1.0, "mm": 1e-3}
 _MILLIMETRES_FROM = 10.0  # no camera is 10 m from the flange or the base that carries it
+_MOST_CAMERAS = 20  # a choice: more poses under numbered keys are those of a motion
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _TOKEN = re.compile(rf"--[a-z][\w-]*|(?<![\w.]){_NUMBER}(?![\w.])|[A-Za-z_/][\w/.-]*")
 _NAMED = re.compile(
@@ -106,7 +106,7 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
     far = float(np.abs(one.numbers[0].p).max())
     unit = one.unit or ("mm" if far > _MILLIMETRES_FROM else "m")
     readings = []
-    for reading in one.readings:
+    for reading in (reading for reading in one.readings if not reading.doubted):
         X = reading.X[0].copy()
         X[:3, 3] *= UNITS.get(unit, 1.0)
         readings.append(replace(reading, X=X))
@@ -122,7 +122,9 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
 
 
 def _chosen(lists: list[Listing], name: str, pose: str | None) -> Listing:
-    single = [one for one in lists if len(one) == 1]
+    single = [one for one in lists if len(one) == 1] or [
+        one.row(k) for one in lists if one.ids and len(one) <= _MOST_CAMERAS for k in range(len(one))
+    ]
     if not single:
         if lists:
             raise DatasetError(
@@ -162,7 +164,7 @@ def _contents(path: Path) -> tuple[list[Listing], _Own]:
         return list(_origins(text, name)), _Own()
     if ending == ".xml":
         return _of_tree(read_tree(path), name)
-    return lists_of_text(text, name), _Own()
+    return lists_of_file(path), _Own()
 
 
 def _of_tree(tree: Any, name: str) -> tuple[list[Listing], _Own]:

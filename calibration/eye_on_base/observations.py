@@ -17,14 +17,14 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.poses.bag import find_bag
-from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
+from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
 from weldcal.calibration.data.poses.source import find_poses
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.geometry.robust import f_quantile
+from weldcal.calibration.geometry.robust import OrderFit, Rows, f_quantile, find_order
 from weldcal.calibration.geometry.se3 import nearest_rotation
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -120,10 +120,71 @@ def fit_flanges(
             if pattern is not None:
                 patterns[id] = pattern
             observations.append(observation_from_fit(id, data.poses[id], fits[id], data.X_FR))
+    if data.in_order and observations:
+        data = _in_found_order(data, observations)
+        observations = [observation_from_fit(id, data.poses[id], fit, data.X_FR) for id, fit in fits.items()]
     if len(data.readings) > 1 and observations:
         data = _read_by_scans(data, observations)
         observations = [observation_from_fit(id, data.poses[id], fit, data.X_FR) for id, fit in fits.items()]
     return FlangeObservations(tuple(observations), fits, patterns, clouds, tuple(refused), data)
+
+
+def _in_found_order(data: Dataset, observations: list[Observation]) -> Dataset:
+    """Return the dataset with its poses in the order that the scans show, where they contradict the present one.
+
+    Distances of centres are the same in the base and the camera, whatever X_BC is.
+
+    Raises InconsistentPoses where some scans may belong to several poses.
+    """
+    every = data.readings or (PoseReading("", "", np.array([X.GetAsMatrix4() for X in data.poses.values()])),)
+    X_FR, ids = data.X_FR.GetAsMatrix4(), list(data.poses)
+    p_CR, n_C = np.array([o.p_CR for o in observations]), np.array([o.n_C for o in observations])
+    present = np.array([ids.index(o.id) for o in observations])
+    if any(_agreement(one, present, p_CR, n_C, X_FR, False).agrees for one in every):
+        return data
+
+    def solve(_: int, __: int, pairs: tuple[Rows, Rows]) -> OrderFit:
+        tried = [_agreement(one, pairs[0], p_CR[pairs[1]], n_C[pairs[1]], X_FR, False) for one in every]
+        one = min(tried, key=_cost)
+        X = one.reading.X @ X_FR
+        off, tilt = X[:, None, :3, 3] - (p_CR @ one.R.T + one.p), X[:, None, :3, 2] - n_C @ one.R.T
+        off2, turn2 = (off**2).sum(axis=2), (tilt**2).sum(axis=2)
+        return OrderFit(turn2=turn2, off2=off2, turn=1.0, extent=one.spread, agrees=one.agrees)
+
+    p_BR = (every[0].X @ X_FR)[:, :3, 3]
+    found = find_order([_distances(p_BR)], [_distances(p_CR)], solve, every[0].X)
+    if found is None or 2 * len(found.unclear) > len(found.first):
+        return data
+    if found.unclear:
+        rows = ", ".join(str(k + 1) for k in found.unclear)
+        raise InconsistentPoses(
+            f"The scans and the poses of '{data.folder.name}' are not in the same order. The scans show the order of"
+            f" all poses but {rows}. Add a column 'id' with the clouds' names, or remove these scans and poses."
+        )
+    rows_of = {int(present[k]): row for row, k in found.partners().items()}
+    rows_of |= dict(
+        zip(
+            sorted(set(range(len(ids))) - set(rows_of)),
+            sorted(set(range(len(ids))) - set(rows_of.values())),
+            strict=True,
+        )
+    )
+    order = [rows_of[k] for k in range(len(ids))]
+    words = ", ".join(f"{id} to row {row + 1}" for id, row in list(zip(ids, order, strict=True))[:12])
+    note = f"The clouds belong to the poses in another order: {words}. The distances between the flanges show it."
+    moved = {id: (data.poses[ids[row]], data.angles.get(ids[row], {})) for id, row in zip(ids, order, strict=True)}
+    return replace(
+        data,
+        poses={id: X for id, (X, _) in moved.items()},
+        angles={id: q for id, (_, q) in moved.items()},
+        readings=tuple(pick(data.readings, np.array(order))),
+        notes=(*data.notes, note),
+    )
+
+
+def _distances(p: Array) -> Array:
+    """Distances (n, n) of points (n, 3)."""
+    return np.asarray(np.linalg.norm(p[:, None] - p, axis=2))
 
 
 def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
@@ -196,7 +257,7 @@ class ScanAgreement:
 
 
 def choose_reading(
-    readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
+    readings: Sequence[PoseReading], rows: Rows, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
     """Return the reading of the flange poses with which the scans agree, and a sentence about it.
 
@@ -229,6 +290,11 @@ def choose_reading(
     best = min(tried + changes, key=_cost)
     dof = max(2 * best.scans - 3, 3)
     limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * len(tried + changes)), dof, dof)))
+    firm = [one for one in tried if not one.reading.doubted]
+    if len(firm) < len(tried):
+        usual = min(firm, key=_cost)
+        if usual.agrees and not _rejected(usual, best, limit):
+            best, tried, changes = usual, firm, []
     if best.changed:
         plain = min(tried, key=_cost)
         if plain.agrees and not _rejected(plain, best, limit):
@@ -239,8 +305,8 @@ def choose_reading(
     alive = [one for one in pool if one is not best and one.agrees and not _rejected(one, best, limit)]
     rivals = [one for one in alive if not _same(one, best)]
     if rivals and best.reading.form != readings[0].form:
-        usual = next((one for one in alive if one.reading.form == readings[0].form), None)
-        if usual is not None and not rivals[1:] and _same(usual, best):
+        first = next((one for one in alive if one.reading.form == readings[0].form), None)
+        if first is not None and not rivals[1:] and _same(first, best):
             rivals = []
     if rivals:
         other = min(rivals, key=_cost)
@@ -282,7 +348,7 @@ def _same(one: ScanAgreement, other: ScanAgreement) -> bool:
     )
 
 
-def _agreement(reading: PoseReading, rows: Array, p_CR: Array, n_C: Array, X_FR: Array, changed: bool) -> ScanAgreement:
+def _agreement(reading: PoseReading, rows: Rows, p_CR: Array, n_C: Array, X_FR: Array, changed: bool) -> ScanAgreement:
     X = reading.X[rows] @ X_FR
     p_B, n_B = X[:, :3, 3], X[:, :3, 2]
     n = len(rows)

@@ -101,6 +101,9 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
             " state the form with --robot-form."
         )
     limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * (len(readings) - 1)), best.dof, best.dof)))
+    firm = [k for k in order if not readings[k].doubted]
+    if firm and fits[firm[0]].rms_m <= limit * best.rms_m:
+        order, best = firm, fits[firm[0]]
     alive = [k for k in order if fits[k].rms_m <= limit * best.rms_m]
     rivals = [k for k in alive[1:] if not _same(fits[k], best)]
     if rivals:

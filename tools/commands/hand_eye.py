@@ -43,7 +43,6 @@ from weldcal.tools.report.render import write_atomic
 
 EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
 
-
 FileArgument = Annotated[
     Path,
     typer.Argument(
@@ -59,7 +58,7 @@ UnitOption = Annotated[
     option(
         "--unit",
         "UNIT",
-        "Unit of all positions: m, mm, cm or inch.",
+        "Unit of all positions: m, mm, cm or inch; inch,mm for robot and camera.",
         show_default="by the robot's reach and the motions",
     ),
 ]
@@ -77,6 +76,9 @@ CameraFormOption = Annotated[
 RobotOption = Annotated[
     str | None,
     option("--robot", "NAME", "The arm, for example ur10e or my_arm.urdf: the next pose is then within its reach."),
+]
+JointsOfOption = Annotated[
+    str | None, option("--robot", "NAME", "The arm (ur10e, my_arm.urdf), where joint angles stand for its poses.")
 ]
 ScannerOption = Annotated[
     str | None, option("--camera", "NAME", "The scanner, for example phoxi_s: the next pose is then in its view.")
@@ -107,6 +109,7 @@ def ax_xb(
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
+    robot: JointsOfOption = None,
     motions: Annotated[bool, switch("--motions", "The file holds motions (A and B of A X = X B), not poses.")] = False,
     robot_poses: RobotPosesOption = None,
     camera_poses: CameraPosesOption = None,
@@ -254,6 +257,7 @@ def run_hand_eye(
     if refine is not None and arm is None:
         raise InputError("Robot errors (--refine) need the robot's name. Add --robot, for example ur10e.")
     streams, shots = None, None
+    stated = replace(stated or StatedForms(), arm=robot)
     if board is not None:
         shots = read_pictures(file, parse_board(board), mounting=mounting, unit=unit, stated=stated, camera=intrinsics)
     elif is_stream_file(file):
@@ -266,7 +270,7 @@ def run_hand_eye(
     if shots is not None:
         pairs = shots.pairs
     else:
-        stated = replace(stated or StatedForms(), decide=not motions)
+        stated = replace(stated, decide=not motions)
         if streams is None and not motions:
             streams = _trajectories(file, mounting, stated)
             if streams is not None:
@@ -366,7 +370,8 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Cloc
         return None
     forms = (stated.robot, stated.camera)
     robot, camera = (
-        one.stated(form, f"--{who}-form") for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
+        one.of_arm(stated.arm).stated(form, f"--{who}-form")
+        for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
     )
     return synchronise_lists(robot, camera, mounting=mounting_name(mounting or "eye_in_hand"), source=path.name)
 

@@ -29,6 +29,7 @@ from weldcal.tools.cli.result_folder import RUNNING
 from weldcal.tools.commands.hand_eye import (
     CameraFormOption,
     CameraPosesOption,
+    JointsOfOption,
     MountingOption,
     RobotFormOption,
     RobotPosesOption,
@@ -87,17 +88,18 @@ def import_(
     robot_form: RobotFormOption = None,
     camera_form: CameraFormOption = None,
     flange: FlangeOption = None,
+    robot: JointsOfOption = None,
 ) -> Outcome:
     """Write poses, pairs or scans of any form as a dataset in weldcal's own form, and print how they were understood.
 
     Pairs become pairs.npz (A, B in m) and table.csv. Scans become poses.csv, clouds/ and dataset.yaml.
     """
-    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
+    stated = replace(stated_forms(robot_poses, camera_poses, robot_form, camera_form), arm=robot)
     folder = call.folder("import", sources[0].resolve().stem)
     if folder.is_dir() and any(one.name not in ("UNFINISHED", RUNNING) for one in folder.iterdir()):
         raise InputError(f"'{folder}' is not empty: choose another folder with --out.")
     if len(sources) == 1 and holds_scans(sources[0]):
-        found = import_scans(sources[0], folder, flange=flange, mounting=mounting)
+        found = import_scans(sources[0], folder, flange=flange, mounting=mounting, robot=robot)
     else:
         found = import_pose_pairs(sources, folder, mounting=mounting, unit=unit, stated=stated)
     return Outcome(found.summary(), values={}, rows=found.lines)
@@ -194,19 +196,21 @@ def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: S
     return first, False
 
 
-def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting: str | None = None) -> Imported:
+def import_scans(
+    source: Path, out: Path, *, flange: str | None = None, mounting: str | None = None, robot: str | None = None
+) -> Imported:
     """Write scans of a flange with their poses as dataset.yaml, poses.csv and clouds/ (linked, else copied).
 
     Raises:
         InputError: they cannot be read; with poses in several possible readings, the flange is not known.
     """
-    data = load_dataset(source)
+    data = load_dataset(source, robot=robot or "")
     if mounting is not None and mounting != data.header.configuration:
         raise InputError(
             f"'{source.name}' is {data.header.configuration}, and the command states {mounting}. Correct one of them."
         )
     name = flange or data.header.flange
-    if len(data.readings) > 1:
+    if sum(not one.doubted for one in data.readings) > 1 or (name and len(data.readings) > 1):
         if not name:
             raise InputError(
                 "The poses fit several conventions, and only the scans can decide. Name the flange, for example"

@@ -179,7 +179,7 @@ def calibrate_carried(
     """
     started = time.monotonic()
     check_limit(limit_mm)
-    data = load_dataset(Path(folder), carried=True)
+    data = load_dataset(Path(folder), robot=robot or "", carried=True)
     data = data if poses is None else data.between(poses)
     scene, circle = recorded_scene(data, robot or data.header.robot, flange or data.header.flange)
     joints = recorded_joints(data, scene)

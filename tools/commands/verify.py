@@ -92,14 +92,12 @@ def verify(
     scenario: Annotated[
         str | None,
         option(
-            "--scenario",
-            "NAME",
-            "Let the robot of this scenario touch the part that its scanner sees, in place of scans.",
+            "--scenario", "NAME", "In place of scans let this scenario's robot touch the part that its scanner sees."
         ),
     ] = None,
     robot: Annotated[
-        str, option("--robot", "NAME", "With --scenario: simulated, emulated or a controller's address.")
-    ] = "simulated",
+        str | None, option("--robot", "NAME", "The arm of joint angles; with --scenario: simulated or an address ...")
+    ] = None,
     points: Annotated[int, option("--points", "N", "With --scenario: places to touch.", min=3, max=60)] = 8,
     flange: FlangeOption = None,
     scanner_correction: CorrectionOption = True,
@@ -137,7 +135,7 @@ def verify(
     if touch is not None or scenario is not None:
         from weldcal.tools.commands.touch import live_touches_outcome, touches_outcome
     if scenario is not None:
-        return live_touches_outcome(call, result, scenario, robot, points)
+        return live_touches_outcome(call, result, scenario, robot or "simulated", points)
     if touch is not None or dataset is None:
         assert touch is not None
         return touches_outcome(call, result, touch)
@@ -160,7 +158,7 @@ def verify(
             limit_mm=limit_mm,
             board=board,
             intrinsics=intrinsics,
-            stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
+            stated=replace(stated_forms(robot_poses, camera_poses, robot_form, camera_form), arm=robot),
             seed=call.seed,
             options=tuple(
                 word for name in of_pairs if of_pairs[name] for word in (name, shlex.quote(f"{of_pairs[name]}"))
@@ -180,6 +178,7 @@ def verify(
         correct_scanner=scanner_correction,
         limit_mm=limit_mm,
         pose=pose,
+        robot=robot,
     )
     summary = report.summary()
     return Outcome(
@@ -201,6 +200,7 @@ def verify_dataset(
     correct_scanner: bool = True,
     limit_mm: float | None = None,
     pose: str | None = None,
+    robot: str | None = None,
 ) -> VerifyReport:
     """Verify a calibration on a dataset folder; write verification.json and report.html.
 
@@ -208,7 +208,8 @@ def verify_dataset(
     in the base, after the result's scanner correction. A scan in which no flange is found is named and not used.
     Without ``correct_scanner`` the result's correction is not applied. ``flange`` overrides dataset.yaml; the fits
     follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what the calibration
-    states. ``pose`` names the pose in a file of several. Nothing is written unless at least one scan can be used.
+    states. ``pose`` names the pose in a file of several.
+    ``robot`` is the arm of joint angles. Nothing is written unless at least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.
@@ -221,7 +222,7 @@ def verify_dataset(
     calibrations, read_as = _calibrations(Path(result), pose)
     calibration = calibrations[0]
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
-    data = load_dataset(Path(dataset), robot=calibration.robot)
+    data = load_dataset(Path(dataset), robot=robot or calibration.robot)
     standard = get_flange(flange or data.header.flange or calibration.flange)
     seen = fit_flanges(
         data,

@@ -148,7 +148,8 @@ class CalibrationReport:
         expected, figure = work_point_expected(work)
         tolerance = limit_tolerance("error at the work point, 95 %", figure, self.limit_mm)
         corrected = correction_note(r, self.out / RESULT_FILE)
-        notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        moved = [text for text in self.notes if "in another order" in text]
+        notes = [*filter(None, (corrected,)), *moved, *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),), self._used)
 

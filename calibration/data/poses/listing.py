@@ -9,6 +9,7 @@ import numpy as np
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.readings import PoseNumbers, PoseReading, parse_form, readings
 from weldcal.calibration.errors import DatasetError
+from weldcal.models.arms.chain import chain_poses, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.files import LARGEST_NUMBER, MOST_POSES
 
@@ -29,6 +30,7 @@ class Listing:
         unit: the unit of length that the file states, or empty.
         form: a phrase for the reader, such as "UR pose vectors".
         left_out: rows (from 0) that hold no pose, with the reason.
+        joints: joint angles (n, joints) rad, or None; without ``numbers`` they stand for the poses.
     """
 
     name: str
@@ -38,9 +40,10 @@ class Listing:
     unit: str = ""
     form: str = ""
     left_out: tuple[tuple[int, str], ...] = ()
+    joints: Array | None = None
 
     def __len__(self) -> int:
-        return len(self.numbers[0].p)
+        return len(self.numbers[0].p) if self.numbers or self.joints is None else len(self.joints)
 
     @cached_property
     def readings(self) -> tuple[PoseReading, ...]:
@@ -51,6 +54,11 @@ class Listing:
         """
         found: list[PoseReading] = []
         problem: DatasetError | None = None
+        if not self.numbers:
+            raise DatasetError(
+                f"'{self.name}' holds joint angles and no poses: name the arm by --robot or in dataset.yaml, such as"
+                " ur10e or my_arm.urdf. Or write the flange's poses as columns x,y,z,qw,qx,qy,qz."
+            )
         for one in self.numbers:
             try:
                 found += readings(one)
@@ -78,7 +86,7 @@ class Listing:
             changes = (*changes, "inverse")
         if angles not in ("", "deg", "rad"):
             raise DatasetError(f"{option} states the angles in '{angles[:20]}'; use deg or rad.")
-        if not (rotation or angles or changes):
+        if not (rotation or angles or changes) or not self.numbers:
             return self
         numbers = tuple(
             replace(one, rotation=rotation or one.rotation, angles=angles or one.angles, changes=changes)
@@ -91,6 +99,31 @@ class Listing:
             ]
             raise DatasetError(f"'{self.name}' holds {held}, and {option} states {rotation}; correct one of them.")
         return replace(self, numbers=numbers)
+
+    def row(self, k: int) -> "Listing":
+        """Return the list of one row alone, named after it."""
+        numbers = tuple(replace(one, p=one.p[k : k + 1], r=one.r[k : k + 1]) for one in self.numbers)
+        left_out = tuple((0, why) for row, why in self.left_out if row == k)
+        name = f"{self.name.partition(',')[0]}, {self.ids[k]}"
+        return replace(self, name=name, numbers=numbers, ids=(self.ids[k],), times=None, left_out=left_out, joints=None)
+
+    def of_arm(self, arm: str | None) -> "Listing":
+        """Return the list with the flange's poses of an arm where it holds joint angles alone.
+
+        Raises DatasetError where the arm has another number of joints.
+        """
+        if self.numbers or self.joints is None or not arm:
+            return self
+        chain = load_chain(arm)
+        if self.joints.shape[1] != chain.n:
+            raise DatasetError(
+                f"'{self.name}' holds {self.joints.shape[1]} joint angles a row, and {chain.name} has {chain.n} joints:"
+                " name the arm that was moved with --robot."
+            )
+        X = chain_poses(chain, self.joints)
+        form = f"{self.form} with the kinematics of {chain.name}"
+        found = listing_of(self.name, X[:, :3, 3], X[:, :3, :3], unit="m", form=form, ids=self.ids, times=self.times)
+        return replace(found, joints=self.joints)
 
 
 def _fits(numbers: PoseNumbers, rotation: str) -> bool:
@@ -107,6 +140,7 @@ def listing_of(
     angles: str = "",
     usual: str = "",
     vector: bool = True,
+    firm: bool = False,
     **more: object,
 ) -> Listing:
     """A list of positions (n, 3) and rotations (n, 3), (n, 4) or (n, 3, 3); rows without a pose are found and replaced.
@@ -114,9 +148,10 @@ def listing_of(
     Raises:
         DatasetError: no row holds a pose, or a number is too large.
     """
-    return _listing(
+    found = _listing(
         name, [(np.asarray(p, dtype=float), np.asarray(r, dtype=float))], rotation, angles, usual, vector, **more
     )
+    return replace(found, numbers=tuple(replace(one, firm=firm) for one in found.numbers)) if firm else found
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
@@ -148,8 +183,9 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
     times = next((t for kind, _, _, t in found if kind == least and t is not None), None)
     if times is not None and more.get("times") is None:
         more["times"] = times
+    whole = v.size % 16 == 0 and v.shape[-1] in (4, 16) and not v.reshape(-1, 16)[:, 12:].any()
     form = {
-        _MATRIX: "4 x 4 matrices",
+        _MATRIX: "4 x 4 matrices" + (" whose last row 0, 0, 0, 0 is taken as 0, 0, 0, 1" if whole else ""),
         _QUATERNION: "x, y, z, quaternion",
         _VECTOR: "x, y, z and three numbers of a rotation",
     }[least]
@@ -215,6 +251,8 @@ def _of_matrices(M: Array) -> Iterator[tuple[int, Array, Array, None]]:
     filled = M[np.isfinite(M).all(axis=(1, 2)) & (np.abs(M[:, :3, :3]).max(axis=(1, 2)) > 0.0)]
     if M.shape[1:] == (4, 4) and len(filled):
         last = np.array([0.0, 0.0, 0.0, 1.0])
+        if not filled[:, 3].any():  # np.zeros((4, 4)) whose last row was forgotten
+            last = np.zeros(4)
         if not (np.abs(filled[:, 3] - last) <= 1e-6).all():
             if not (np.abs(filled[:, :, 3] - last) <= 1e-6).all():
                 return

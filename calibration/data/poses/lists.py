@@ -13,17 +13,18 @@ import numpy as np
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
 from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
 from weldcal.calibration.data.poses.storage import matlab_arrays, read_tree, tree_of_text
-from weldcal.calibration.data.poses.text import lists_of_text
+from weldcal.calibration.data.poses.text import keyed_lists, lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 TEXT = (
     ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc",
     ".urp", ".sys", ".jbi",
-    ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out",
+    ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out", ".tfm", ".g2o",
 )  # fmt: skip
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
@@ -31,6 +32,11 @@ ENDINGS = (*TEXT, *TREES, *ARRAYS)
 """Endings of files that may hold poses."""
 _OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
 _CLOUDS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd")
+PICKLED = (
+    "'{}' holds Python objects (a pickle), which may run code: save the two arrays with numpy.savez(file, robot=...,"
+    " camera=...)."
+)
+_COPIED = 1e-3  # a choice: copies with three decimals or more
 _BEGINNING = 4000  # characters that show what a text is
 _TREE_TEXT = re.compile(
     r"(?m)^\s*(position|translation|orientation|rotation|pose|transforms?):[ \t\r]*$|\A\s*\[?\s*\{\s*\""
@@ -60,13 +66,14 @@ def lists_of_file(path: Path) -> list[Listing]:
         if ending == ".npz":
             return lists_of_tree(dict(read_npz(path)), path.name)
         if ending == ".npy":
-            return [listing_of_array(path.name, _numbers(path, read_npy(path)))]
+            return [listing_of_array(path.name, _numbers(path, _array(path)))]
         if ending == ".mat" and not _is_text(path):
             return lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name)
         if ending == ".xlsx":
             return _workbook(path)
         if ending in TREES:
-            return lists_of_tree(read_tree(path), path.name)
+            lines = keyed_lists(read_text(path), path.name) if ending == ".xml" else []
+            return lines or lists_of_tree(read_tree(path), path.name)
         if ending == ".urp":
             return lists_of_text(_unzipped(path), path.name)
         require_few_lines(path)
@@ -199,6 +206,8 @@ def two_lists(
     Raises:
         DatasetError: a stated name is in none or several lists, or the names do not tell which list is whose.
     """
+    if any(one.numbers and whose(one.name) == "robot" for one in lists):
+        lists = [one for one in lists if one.numbers]  # joint angles beside the robot's poses
     many = [one for one in lists if len(one) > 1]
     if robot is None and camera is None and len(many) > 1:
         lists = many  # a pose alone beside lists is a result
@@ -214,10 +223,13 @@ def two_lists(
     rest = [one for one in lists if one not in chosen.values()]
     for who in ("robot", "camera"):
         if who not in chosen:
-            mine = [one for one in rest if whose(one.name) == who]
+            mine = [one for one in rest if (whose(one.name) if one.numbers else "robot") == who]
+            mine = without_copies(mine) if len(mine) > 1 else mine
             if len(mine) == 1:
                 chosen[who] = mine[0]
     rest = [one for one in lists if one not in chosen.values()]
+    if len(chosen) == 1 and len(rest) > 1:
+        rest = without_copies(rest)
     if len(chosen) == 1 and len(rest) == 1:
         chosen["robot" if "camera" in chosen else "camera"] = rest[0]
     if len(chosen) == 2:
@@ -236,6 +248,28 @@ def two_lists(
         f"The names of the lists in '{source}' do not show which one has {missing} poses: {known}. Name them with"
         " --robot-poses and --camera-poses."
     )
+
+
+def without_copies(lists: list[Listing]) -> list[Listing]:
+    """Return the lists of poses without those that hold the numbers of another one, in any form."""
+    kept: list[Listing] = []
+    if len(lists) < 2:
+        return lists
+    for one in sorted((one for one in lists if one.numbers), key=lambda one: len(one.readings)):
+        if not any(len(other) == len(one) and _alike(other, one) for other in kept):
+            kept.append(one)
+    return [one for one in lists if one in kept]
+
+
+def _alike(other: Listing, one: Listing) -> bool:
+    return any(np.abs(_unscaled(r.X) - _unscaled(other.readings[0].X)).max() < _COPIED for r in one.readings)
+
+
+def _unscaled(X: Array) -> Array:
+    """Poses with positions in units of their rms distance."""
+    X = X.copy()
+    X[:, :3, 3] /= np.sqrt((X[:, :3, 3] ** 2).sum(axis=1).mean()) + 1e-12
+    return X
 
 
 def named_inverse(listing: Listing) -> bool:
@@ -296,6 +330,15 @@ def _unzipped(path: Path) -> str:
     if len(found) > LARGEST_DOCUMENT:
         raise DatasetError(f"'{path.name}' holds more than {LARGEST_DOCUMENT // 2**20} MiB of text.")
     return found.decode("utf-8", "replace")
+
+
+def _array(path: Path) -> Any:
+    try:
+        return read_npy(path)
+    except InputError as problem:
+        if "holds object" not in str(problem):
+            raise
+        raise DatasetError(PICKLED.format(path.name)) from problem
 
 
 def _numbers(path: Path, value: Any) -> Any:

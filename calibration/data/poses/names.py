@@ -54,7 +54,7 @@ _POSITION = {
     "linear",
     "coord",
 }
-_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
+_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad", "theta"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
@@ -75,13 +75,24 @@ _OWNERS = (
 )
 _WHOLE = {
     "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
+    "e", "u", "v", "ez", "ey", "ex", "n1", "n2", "n3", "ox", "oy", "oz",
 }  # fmt: skip
+_WHOLE_ONLY = (("w", "u", "v"), ("a", "r", "e", "e"), ("ox", "oy", "oz", "th", "th"))
+"""Letters of makers whose last two mean nothing without the others: pixels, errors and angles have such names, too."""
 _EULER_WORDS = (
     ("alpha", "beta", "gamma"),
     ("phi", "theta", "psi"),
     ("angle1", "angle2", "angle3"),
     ("euler1", "euler2", "euler3"),
 )
+_JOINT = re.compile(r"(?:(.*)[._\s])?(?:q|j|jt|a|ax|axis|achse|joint|theta|th|position)[_\s]?([0-9])(?:_[a-z])?")
+_JOINTS_BY_NAME = (
+    ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
+    ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"),
+    ("s", "l", "u", "r", "b", "t"),
+)
+"""Names of six joints: Universal Robots in ROS and on the pendant, Yaskawa."""
+_FEWEST_JOINTS = 5
 _UNIT = re.compile(r"[\[(]\s*([a-zA-Z°]*)\s*[\])]|[_\s](mm|cm|m|in|inch|deg|rad|degrees|radians|°)$")
 _UNITS = {
     "degrees": "deg",
@@ -185,19 +196,49 @@ class PoseColumn:
     index: int
 
 
+@dataclass(frozen=True)
+class JointColumns:
+    """The columns of a robot's joint angles in the order of the joints: whose, their places, their unit or empty."""
+
+    prefix: str
+    indices: tuple[int, ...]
+    unit: str
+
+
+def joint_columns(header: list[str]) -> list[JointColumns]:
+    """Return the columns of joint angles of a header, for each robot: five or more of numbered or well known names."""
+    plain = [_unit_of(h.strip().lower()) for h in header]
+    groups: dict[str, dict[int, int]] = {}
+    for k, (name, _) in enumerate(plain):
+        if part := _JOINT.fullmatch(name):
+            groups.setdefault(f"{part[1] or ''}/{name[len(part[1] or '') : part.start(2)]}", {})[int(part[2])] = k
+    names = [re.sub(r"_joint|_(deg|rad|position)$", "", name) for name, _ in plain]
+    for words in _JOINTS_BY_NAME:
+        if set(words) <= set(names):
+            groups[f"/{words[0]}"] = {number: names.index(word) for number, word in enumerate(words)}
+    found = []
+    for key, places in groups.items():
+        numbers = sorted(places)
+        if len(numbers) >= _FEWEST_JOINTS and numbers[0] < 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+            units = {plain[k][1] for k in places.values()}
+            unit = units.pop() if len(units) == 1 else ""
+            found.append(JointColumns(key.partition("/")[0], tuple(places[n] for n in numbers), unit))
+    return [one for one in found if not one.prefix.endswith("target")] or found
+
+
 def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
     """Return the columns of poses of a header, and the places of its ids and times.
 
     Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
-    for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to
-    m33.
+    for sure); roll, pitch, yaw; e1, e2, e3 (other angles); m00 to m33; letters of a maker, see `text`.
     """
     found: list[PoseColumn] = []
     other: dict[str, int] = {}
     plain = [_unit_of(h.strip().lower()) for h in header]
-    joints = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
+    joints = {k for one in joint_columns(header) for k in one.indices}
+    arm = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
     for k, (name, unit) in enumerate(plain):
-        if joints and re.fullmatch(r"q[0-9]", name):
+        if k in joints or (arm and re.fullmatch(r"q[0-9]", name)):
             continue
         if name in IDS and "id" not in other:
             other["id"] = k
@@ -209,7 +250,20 @@ def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
         for prefix, role in _roles(name):
             found.append(PoseColumn(prefix, role, unit, k))
             break
+    roles = {c.role for c in found}
+    alone = {role for whole in _WHOLE_ONLY if not set(whole) <= roles for role in whole[-2:]}
+    found = [c for c in found if c.role not in alone]
     return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
+
+
+def distinct(header: list[str]) -> list[str]:
+    """Return a header whose Y after R and P (Nachi: turns about z, y and x) has a name other than the position's."""
+    plain = [_unit_of(h.strip().lower())[0] for h in header]
+    at = next((k for k in range(3, len(plain) - 2) if plain[k : k + 3] == ["r", "p", "y"] and "y" in plain[:k]), None)
+    if at is None:
+        return header
+    turned = [f"n{k + 1}{header[at + k].strip()[1:]}" for k in range(3)]
+    return [*header[:at], *turned, *header[at + 3 :]]
 
 
 def _is_t_of_oat(name: str, names: list[str]) -> bool:
@@ -236,9 +290,13 @@ def _roles(name: str) -> list[tuple[str, str]]:
     if not tokens:
         return []
     last, before = tokens[-1], tokens[:-1]
+    if before[-1:] == ["o"] and last in ("x", "y", "z"):
+        return [(_prefix(before[:-1]), f"o{last}")]  # the axis of an orientation vector (viam)
+    if last in ("th", "theta"):
+        return [(_prefix(before), "th")]
     if last in ("a", "b", "c", "w", "p", "r", "o") and len(before) == 1 and before[0] in _OWNERS:
         return [(before[0], last)]
-    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
+    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv|theta)([wxyz])", last):
         before, last = [*before, short[1]], short[2]
     if (short := re.fullmatch(r"(.+?)([xyz]|q[wxyz]|r[xyz])", last)) and short[1] in _OWNERS:
         before, last = [*before, short[1]], short[2]

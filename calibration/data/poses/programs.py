@@ -35,7 +35,9 @@ _JOINTS = re.compile(
     re.MULTILINE,
 )
 _UR = re.compile(rf"p\s*\[\s*({NUMBER}(?:\s*,\s*{NUMBER}){{5}})\s*\]")
-_UR_SETTINGS = re.compile(r"set_tcp\s*\(|set_payload\s*\(|set_gravity\s*\(|_tcp\s*=")
+_UR_SETTINGS = re.compile(r"(?i)set_tcp\s*\(|set_payload\s*\(|set_gravity\s*\(|tcp\s*:?=")
+_TFM = re.compile(r"(?m)^Parameters:((?:[ \t]+\S+){12})[ \t\r]*$")
+_G2O = re.compile(rf"(?m)^VERTEX_SE3:QUAT[ \t]+(\d+)((?:[ \t]+{NUMBER}){{7}})[ \t\r]*$")
 _RAPID = re.compile(
     rf"(?:\b(\w{{1,80}})\s{{0,9}}:=\s{{0,9}})?\[\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{2}})\]"
     rf"\s*,\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{3}})\]"
@@ -124,7 +126,11 @@ def _ur(text: str, name: str) -> Listing | None:
         if not line.lstrip().startswith("#") and not _UR_SETTINGS.search(line)
         for pose in _UR.findall(line)
     ]
-    return _listed(name, rows, "UR poses (x, y, z, rotation vector)", "m", "rotation_vector")
+    tcp = re.search(rf"(?m)^[^#\n]*set_tcp\s*\(\s*p\s*\[\s*({_SIX})", text)
+    form = "UR poses (x, y, z, rotation vector)"
+    if tcp is not None and any(_floats(tcp[1])):
+        form += f" of the TCP {tcp[1]}, not of the flange"
+    return _listed(name, rows, form, "m", "rotation_vector")
 
 
 def _calls(text: str, name: str) -> Listing | None:
@@ -183,6 +189,21 @@ def _kawasaki(text: str, name: str) -> Listing | None:
     return _listed(name, rows, "Kawasaki transformations", "mm", "euler_ZYZ", [m[0] for m in found])
 
 
+def _itk(text: str, name: str) -> Listing | None:
+    found = [_floats(m) for m in _TFM.findall(text)] if "Insight Transform File" in text else []
+    if not found:
+        return None
+    rows = np.array(found)
+    form = "ITK transforms (LPS: x and y negated)"
+    return listing_of(name, rows[:, 9:], rows[:, :9].reshape(-1, 3, 3), rotation="matrix", unit="mm", form=form)
+
+
+def _g2o(text: str, name: str) -> Listing | None:
+    found = _G2O.findall(text)
+    rows = [_floats(m[1]) for m in found]
+    return _listed(name, rows, "g2o vertices", "m", "quaternion_xyzw", [m[0] for m in found])
+
+
 def list_of_program(text: str, name: str) -> Listing | None:
     """Return the poses of a robot program, a pose file or a log of transforms; None where the text is none of them.
 
@@ -190,7 +211,7 @@ def list_of_program(text: str, name: str) -> Listing | None:
         DatasetError: it holds joint angles and no poses.
     """
     arms = (_rapid, _kuka, _fanuc, _yaskawa, _staubli, _kawasaki)
-    for program in (*arms, _ur_waypoints, _halcon, _transforms, _ur, _calls):
+    for program in (*arms, _ur_waypoints, _halcon, _transforms, _ur, _calls, _itk, _g2o):
         found = program(text, name)
         if found is not None:
             return found

@@ -56,6 +56,7 @@ class PoseNumbers:
         changes: stated changes, some of CHANGES.
         usual: the notation that comes first where none is stated; a rotation vector where it is empty.
         vector: whether three numbers may be a rotation vector (roll, pitch and yaw are none).
+        firm: whether another notation than the usual one is tried only where that contradicts the data.
     """
 
     source: str
@@ -66,6 +67,7 @@ class PoseNumbers:
     changes: tuple[str, ...] = ()
     usual: str = ""
     vector: bool = True
+    firm: bool = False
 
     @property
     def kind(self) -> str:
@@ -81,11 +83,13 @@ class PoseReading:
         form: what selects it, such as ``euler_xyz,deg`` or ``matrix,transposed``.
         words: the same for a reader.
         X: the poses (n, 4, 4), positions in the file's unit.
+        doubted: whether the data must first contradict the list's usual reading.
     """
 
     form: str
     words: str
     X: Array
+    doubted: bool = False
 
     def changed(self, change: str) -> "PoseReading":
         """Return the reading with one of CHANGES applied."""
@@ -94,7 +98,8 @@ class PoseReading:
             "left_handed": "in a left-handed frame (y mirrored)",
             "inverse": "inverted",
         }[change]
-        return PoseReading(f"{self.form},{change}", f"{self.words}, {words}", apply_change(self.X, change))
+        X = apply_change(self.X, change)
+        return replace(self, form=f"{self.form},{change}", words=f"{self.words}, {words}", X=X)
 
 
 def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[PoseReading]:
@@ -124,7 +129,8 @@ def readings(numbers: PoseNumbers) -> list[PoseReading]:
     """
     found = []
     for form, words, R in _rotations(numbers):
-        one = PoseReading(form, words, pose(R, numbers.p))
+        doubted = numbers.firm and not numbers.rotation and not form.startswith(numbers.usual)
+        one = PoseReading(form, words, pose(R, numbers.p), doubted)
         for change in numbers.changes:
             one = one.changed(change)
         found.append(one)

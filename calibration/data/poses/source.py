@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.checks import read_rows
+from weldcal.calibration.data.checks import JOINT_NAME, read_rows
 from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import ENDINGS as READ
 from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, natural, number_of, whose
+from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, joint_columns, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.errors import DatasetError
@@ -57,6 +57,8 @@ class PoseList:
         read_as: a phrase for the user.
         readings: all readings that the numbers allow, the used one first; empty where there is one.
         left_out: rows without a pose: name and reason.
+        joints: joint angles (n, joints) rad of the rows, or None.
+        computed: whether the poses are those of the flange at these angles.
     """
 
     source: str
@@ -67,6 +69,8 @@ class PoseList:
     read_as: str = ""
     readings: tuple[PoseReading, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
+    joints: Array | None = None
+    computed: bool = False
 
 
 def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
@@ -201,6 +205,9 @@ def is_plain(path: Path) -> bool:
     columns, _ = columns_of(names)
     roles = {c.role for c in columns}
     own = {"x", "y", "z", "qw", "qx", "qy", "qz"}
+    joints = [names[k] for one in joint_columns(names) for k in one.indices]
+    if joints and not (roles and all(map(JOINT_NAME.fullmatch, joints))):
+        return False
     return "id" in names and roles <= own and not any(c.unit for c in columns) and not any("." in n for n in names)
 
 
@@ -218,8 +225,11 @@ def _files(folder: Path) -> list[Path]:
     return sorted(found, key=lambda p: natural(p.name))
 
 
-def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
-    """The poses of a file, or of one file per pose. Raises DatasetError, one sentence that says what to change."""
+def read_poses(source: Path | tuple[Path, ...], form: PoseForm, arm: str = "") -> PoseList:
+    """The poses of a file, or of one file per pose; ``arm``: the kinematics of joint angles that stand for poses.
+
+    Raises DatasetError, one sentence that says what to change.
+    """
     if isinstance(source, tuple):
         lists = [lists_of_file(path) for path in source]
         many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
@@ -233,7 +243,8 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
         found = replace(found, form=f"one file per pose, {found.form}")
     else:
         found = robot_list(read_lists(source), source.name, form)
-    found = found.stated(replace(form, frame="flange_in_base"), "dataset.yaml: poses.rotation")
+    computed = not found.numbers
+    found = found.of_arm(arm).stated(replace(form, frame="flange_in_base"), "dataset.yaml: poses.rotation")
     good = found.good
     readings = tuple(pick(found.readings, np.flatnonzero(good)))
     ids = tuple(i for i, keep in zip(found.ids, good, strict=True) if keep) if found.ids else ()
@@ -246,6 +257,8 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
         read_as=found.form if len(readings) == 1 else f"{found.form}, {readings[0].words}",
         readings=readings,
         left_out=tuple((found.ids[k] if found.ids else f"row {k + 1}", why) for k, why in found.left_out),
+        joints=None if found.joints is None else found.joints[good],
+        computed=computed,
     )
 
 
@@ -297,6 +310,8 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
         )
     if form.frame not in _FRAMES:
         raise DatasetError(f"dataset.yaml names the frame '{form.frame[:40]}'; write {' or '.join(_FRAMES)}.")
+    if found.computed:
+        form = PoseForm()
     X = inverse(found.X) if form.frame == "base_in_flange" else found.X.copy()
     if unit == "auto":
         unit = found.unit or ("mm" if float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) > _MILLIMETRES else "m")

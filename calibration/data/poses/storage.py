@@ -54,7 +54,7 @@ def tree_of_text(text: str, name: str, kind: str = "YAML") -> Any:
     text = re.sub(r"\A%YAML[:\s]\S*\s*?\n", "", text)  # FileStorage writes a directive that YAML does not know
     documents = [one for one in re.split(r"(?m)^(?:---|\.\.\.)[ \t]*\r?$", text) if one.strip()]
     if len(documents) < 2:
-        return _matrices(parse_document(name, text, kind))
+        return _matrices(parse_document(name, next(iter(documents), text), kind))
     return [_matrices(parse_document(name, one, kind)) for one in documents]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.names import PoseColumn, columns_of, whose
+from weldcal.calibration.data.poses.names import JointColumns, PoseColumn, columns_of, distinct, joint_columns, whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -27,7 +27,13 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
+_ARRAY = re.compile(r"\b(?:np\.|numpy\.)?(?:array|matrix)\s*\(")
+_NAMED_ARRAY = re.compile(r"(?m)^[ \t]*[A-Za-z_]\w{0,40}[ \t]*=[ \t]*(?=\[\[)")
+"""What stands before the numbers of an array that was pasted from Python."""
+_SECONDS = 1e8  # a choice: a first column from here on counts seconds since 1970, and below it rows
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
+_TURN_RAD = 7.0  # a whole turn and a little: larger joint angles are degrees
+_MOST_TURNS_DEG = 3600.0  # a choice: beyond ten turns numbers are pulses of an encoder
 _NUMBERED = ("q0 q1 q2 q3", "q1 q2 q3 q4")
 _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     *(
@@ -38,9 +44,13 @@ _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("vx vy vz", {"rotation": "rotation_vector", "form": "x, y, z, rotation vector"}),
     ("rx ry rz", {"form": "x, y, z, rx, ry, rz"}),
     ("roll pitch yaw", {"usual": "euler_xyz", "vector": False, "form": "x, y, z, roll, pitch, yaw"}),
-    ("a b c", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, KUKA A, B, C"}),
+    ("a b c", {"usual": "euler_ZYX", "firm": True, "vector": False, "angles": "deg", "form": "x, y, z, A, B, C"}),
     ("w p r", {"rotation": "euler_xyz", "angles": "deg", "form": "x, y, z, Fanuc W, P, R"}),
     ("o a t", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, O, A, T"}),
+    ("a e r", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, Comau A, E, R"}),
+    ("u v w", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, Epson U, V, W"}),
+    ("ez ey ex", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, ABB EZ, EY, EX"}),
+    ("n1 n2 n3", {"usual": "euler_ZYX", "vector": False, "angles": "deg", "form": "x, y, z, Nachi R, P, Y"}),
     ("e1 e2 e3", {"vector": False, "form": "x, y, z and three angles"}),
 )
 """The columns of a rotation, and what they say of it, in the order in which they are sought."""
@@ -58,23 +68,26 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
     """
     text = text.lstrip("\ufeff")
     require_short_numbers(text, name)
+    text = _ARRAY.sub("", text)
+    if len(_NAMED_ARRAY.findall(text)) == 1:
+        text = _NAMED_ARRAY.sub("", text)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
             f"'{name}' is COLMAP's images.txt, whose poses are inverted (world in camera) and have no unit of length."
             " Invert them, scale them to metres by a known length, and write them as a table x,y,z,qw,qx,qy,qz."
         )
     found = list_of_program(text, name)
-    return [found] if found is not None else _keyed(text, name) or _numbers(text, name)
+    return [found] if found is not None else keyed_lists(text, name) or _numbers(text, name)
 
 
-def _keyed(text: str, name: str) -> list[Listing]:
+def keyed_lists(text: str, name: str) -> list[Listing]:
     """Return the lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each.
 
     Empty where it has none.
     """
     rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
     names = [key for key, _ in rows[0]] if len(rows) > 1 else []
-    if not names or any([key for key, _ in row] != names for row in rows) or len(columns_of(names)[0]) < 6:
+    if not names or any([key for key, _ in row] != names for row in rows) or _named(names) < 5:
         return []
     return table_lists(names, np.array([[float(value) for _, value in row] for row in rows]), name)
 
@@ -113,9 +126,7 @@ def _numbers(text: str, name: str) -> list[Listing]:
             f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or"
             " rx,ry,rz, or 6, 7 or 16 numbers a row."
         )
-    commented = next(
-        (c for c in reversed(comments) if c.number < rows[0].number and len(columns_of(c.cells)[0]) >= 6), None
-    )
+    commented = next((c for c in reversed(comments) if c.number < rows[0].number and _named(c.cells) >= 6), None)
     if commented is not None and len(commented.cells) == len(rows[0].cells):
         return _table(commented.cells, rows, name)
     captions = _captioned(lines)
@@ -160,8 +171,9 @@ def _whole_header(lines: list[_Line], at: int) -> tuple[list[str], list[_Line]]:
     """The names of a header of one or two lines with the units of a line below it, and the lines below."""
     names, rest = list(lines[at].cells), lines[at + 1 :]
     above = lines[at - 1].cells if at else []
-    if len({n.lower() for n in names}) < len(names) and 1 < len(above) <= len(names) and not _filled(lines[at - 1]):
+    if len({n.lower() for n in names}) < len(names) and 1 < len(above) <= len(names) + 1 and not _filled(lines[at - 1]):
         owner, joined = "", []
+        names += [""] * (len(above) - len(names))
         for k, name in enumerate(names):
             owner = above[k] if k < len(above) and above[k] else owner
             joined.append(f"{owner} {name}".strip())
@@ -222,6 +234,8 @@ def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
         table = _stamped(table)
     step = np.diff(table[:, 0])
     counted = n in (7, 8, 13, 17) and len(table) > 1 and bool((step == step[0]).all()) and step[0] in (0.0, 1.0)
+    if counted and step[0] and table[0, 0] > _SECONDS:
+        return replace(listing_of_array(name, table[:, 1:]), ids=ids, times=table[:, 0])
     if counted and (n != 7 or not _quaternion_rows(table)):
         found = listing_of_array(name, table[:, 1:])
         return replace(found, ids=ids or (tuple(str(int(v)) for v in table[:, 0]) if step[0] else ()))
@@ -287,11 +301,17 @@ def _all_numbers(cell: str) -> bool:
 
 
 def _is_header(line: _Line, rest: Sequence[_Line]) -> bool:
-    found, _ = columns_of(line.cells)
-    return len(found) >= 5 and line.numeric <= len(line.cells) // 3 and any(r.numeric >= 5 for r in rest[:5])
+    return _named(line.cells) >= 5 and line.numeric <= len(line.cells) // 3 and any(r.numeric >= 5 for r in rest[:5])
+
+
+def _named(header: Sequence[str]) -> int:
+    """How many columns of poses, or else of joint angles, a header names."""
+    columns, joints = columns_of(list(header))[0], joint_columns(list(header))
+    return max(len(columns), *(len(one.indices) for one in joints), 0)
 
 
 def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
+    header = distinct(header)
     _, other = columns_of(header)
     again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
     if again is not None:
@@ -344,7 +364,7 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     """Return the lists of poses of a table (n, columns) of numbers with named columns.
 
     Raises:
-        DatasetError: a list has no position or no rotation.
+        DatasetError: a list has no position or no rotation, or an angle of a joint is none.
     """
     columns, other = columns_of(header)
     times = table[:, other["time"]] if "time" in other else None
@@ -357,7 +377,30 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
         mine = [c for c in columns if c.prefix == prefix]
         label = name if len(prefixes) == 1 else f"{name}, {prefix or 'other'}"
         found.append(_columns(label, mine, table, ids, times))
-    return found
+    joints = joint_columns(header)
+    robots = [one for one in found if whose(one.name) != "camera"]
+    if not joints or (robots and float(np.nanmax(np.abs(table[:, joints[0].indices]), initial=0.0)) > _MOST_TURNS_DEG):
+        return found
+    q, words = _joints(joints[0], table, name)
+    if not robots:
+        bad = np.flatnonzero(~np.isfinite(q).all(axis=1))
+        left_out = tuple((int(k), "A joint angle is missing or not finite.") for k in bad)
+        label = f"{name}, robot" if found else name
+        more: dict[str, Any] = {"ids": ids, "times": times, "form": words, "left_out": left_out}
+        return [*found, Listing(name=label, numbers=(), joints=np.where(np.isfinite(q), q, 0.0), **more)]
+    return [replace(one, joints=q) if one in robots else one for one in found]
+
+
+def _joints(columns: JointColumns, table: Array, name: str) -> tuple[Array, str]:
+    """Joint angles (n, joints) rad, NaN where there is none, and a phrase. Raises DatasetError for no angles."""
+    q = table[:, columns.indices]
+    largest = float(np.nanmax(np.abs(q), initial=0.0))
+    if not np.isfinite(largest) or largest > _MOST_TURNS_DEG:
+        raise DatasetError(f"'{name}' has a joint angle of {largest:.6g}: write angles in degrees or radians.")
+    degrees = columns.unit == "deg" or (columns.unit != "rad" and largest > _TURN_RAD)
+    if columns.unit == "rad" and largest > _TURN_RAD:
+        raise DatasetError(f"'{name}' states joint angles in rad, and one is {largest:.4g}: they look like degrees.")
+    return np.radians(q) if degrees else q, f"joint angles in {'degrees' if degrees else 'radians'}"
 
 
 def _columns(name: str, columns: list[PoseColumn], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
@@ -378,6 +421,12 @@ def _columns(name: str, columns: list[PoseColumn], table: Array, ids: tuple[str,
     if not {"x", "y", "z"} <= set(at):
         raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
     p = take("x", "y", "z")
+    if {"ox", "oy", "oz", "th"} <= set(at):
+        o, th = take("ox", "oy", "oz"), np.radians(take("th"))
+        o = o / np.linalg.norm(o, axis=1, keepdims=True)
+        turns = np.column_stack([np.arctan2(o[:, 1], o[:, 0]), np.arccos(np.clip(o[:, 2], -1.0, 1.0)), th[:, 0]])
+        more["form"] = "x, y, z, orientation vector"
+        return listing_of(name, p, turns, rotation="euler_ZYZ", angles="rad", **more)
     for words, stated in _ROTATIONS:
         roles = words.split()
         if set(roles) <= set(at) and not (words in _NUMBERED and {"rx", "ry", "rz"} <= set(at)):

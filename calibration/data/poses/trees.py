@@ -226,6 +226,7 @@ def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listi
                 angles=first.angles,
                 usual=first.usual,
                 vector=first.vector,
+                firm=first.firm,
                 ids=ids,
                 unit=lists[0].unit if len(units) == 1 else "",
                 form=lists[0].form,
@@ -318,7 +319,9 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
 
 
 def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
-    """Return a rotation of an angle about an axis as a rotation vector; empty where the mapping is none."""
+    """Return an angle about an axis as a rotation vector, an orientation vector under its names; empty for others."""
+    if {"x", "y", "z", "th"} <= set(value):
+        return {f"{path}.{k if k == 'th' else f'o_{k}'}": as_number(value[k]) for k in ("x", "y", "z", "th")}
     axis, angle = _array(value.get("axis")) if isinstance(value.get("axis"), list) else None, value.get("angle")
     if axis is None or axis.shape != (3,) or not isinstance(angle, int | float):
         return {}

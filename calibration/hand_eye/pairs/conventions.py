@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
-from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, nearest_rotation
+from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
+from weldcal.calibration.geometry.robust import FoundOrder, OrderFit, Rows, f_quantile, find_order
+from weldcal.calibration.geometry.se3 import angle_of, exp_rotation, inverse, log_rotation, nearest_rotation
 from weldcal.models.arrays import Array
 
 CHANCE = 1e-6  # as for readings of a dataset (eye_on_base/observations.py)
@@ -27,6 +27,7 @@ _MOST = 160
 _SURE_TURN = 2.8  # rad
 _ONE_AXIS = 0.1  # share of the turns off the main axis below which rotations do not determine X about it
 _STEPS = 6
+_CHANGED = 3  # more than two lists in doubted readings
 _TRIAL_STEPS = 2
 
 
@@ -44,7 +45,7 @@ class ReadingAgreement:
         position: rms residual of the positions, in the robot's unit.
         extent: rms distance of the robot's positions from their mean, in its unit.
         X, Y: the solution of F X G = Y, positions in the robot's unit.
-        changes: how many lists are changed beyond what is stated.
+        changes: 3 where a list is changed beyond what is stated, and 1 for each list in a doubted reading.
         dof: degrees of freedom of each residual.
     """
 
@@ -65,7 +66,7 @@ class ReadingAgreement:
     @property
     def changed(self) -> bool:
         """Whether a list is transposed, left-handed or inverted beyond what is stated."""
-        return self.changes > 0
+        return self.changes >= _CHANGED
 
     @property
     def agrees(self) -> bool:
@@ -123,12 +124,13 @@ def decide(
 
 def _judge(tried: list[ReadingAgreement], count: int) -> ReadingDecision:
     best = min(tried, key=lambda t: t.cost)
-    if best.changed:
-        # a list that need not be changed is not changed
-        plain = [t for t in tried if not t.changed]
+    for least in sorted({t.changes for t in tried if t.changes < best.changes}):
+        # a list that need not be changed, or read in a doubted way, is not
+        plain = [t for t in tried if t.changes <= least]
         first = min(plain, key=lambda t: t.cost)
         if not _rejected(first, best, _limit(best.dof, count)):
             best, tried = first, plain
+            break
     limit = _limit(best.dof, count)
     alive: list[ReadingAgreement] = []
     dead: list[ReadingAgreement] = []
@@ -175,10 +177,11 @@ def _same(one: ReadingAgreement, other: ReadingAgreement) -> bool:
 
 def _variants(robot: PoseReading, camera: PoseReading, changes: bool) -> list[tuple[PoseReading, PoseReading, int]]:
     """Return the two readings as they are and with one change of one list ."""
-    found = [(robot, camera, 0)]
+    doubted = int(robot.doubted) + int(camera.doubted)
+    found = [(robot, camera, doubted)]
     if changes:
-        found += [(robot.changed(c), camera, 1) for c in CHANGES]
-        found += [(robot, camera.changed(c), 1) for c in CHANGES]
+        found += [(robot.changed(c), camera, doubted + _CHANGED) for c in CHANGES]
+        found += [(robot, camera.changed(c), doubted + _CHANGED) for c in CHANGES]
     return found
 
 
@@ -261,6 +264,41 @@ def agreements(
         )
         found.append(agreement)
     return found
+
+
+def order_of(robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye_in_hand: bool) -> FoundOrder | None:
+    """Return the order in which two lists of poses (n) and (m) agree, by the angles of their motions; None without one.
+
+    Args:
+        robot, camera: the readings of all rows of each list.
+        eye_in_hand: the mounting, as stated.
+    """
+    F = [one.X if eye_in_hand else inverse(one.X) for one in robot]
+
+    def solve(a: int, b: int, pairs: tuple[Rows, Rows]) -> OrderFit:
+        some = [(pick([robot[a]], pairs[0])[0], pick([camera[b]], pairs[1])[0], 0)]
+        (one,) = agreements(some, eye_in_hand=eye_in_hand)
+        X, Y, scale, G = one.X, one.Y, one.scale if one.unit_scale is None else one.unit_scale, camera[b].X
+        moved = np.einsum("ca,ncd,de->nae", Y[:3, :3], F[a][:, :3, :3], X[:3, :3])
+        trace = np.einsum("nab,mba->nm", moved, G[:, :3, :3])
+        at = np.einsum("nab,mb->nma", F[a][:, :3, :3], scale * G[:, :3, 3] @ X[:3, :3].T + X[:3, 3])
+        off = at + (F[a][:, :3, 3] - Y[:3, 3])[:, None]
+        return OrderFit(
+            turn2=np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) ** 2,
+            off2=(off**2).sum(axis=2),
+            turn=one.turn,
+            extent=one.extent,
+            agrees=one.agrees,
+        )
+
+    ours, theirs = ([_all_angles(one.X) for one in listed] for listed in (robot, camera))
+    return find_order(ours, theirs, solve, robot[0].X)
+
+
+def _all_angles(X: Array) -> Array:
+    """Angles (n, n) rad of the motions between poses: the same from either side."""
+    R = X[:, :3, :3]
+    return angle_of(np.einsum("aji,bjk->abik", R, R, optimize=True))
 
 
 def _worth_solving(spread: Array, changes: Array, limit: float) -> Array:

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.checks import read_rows
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import folder_lists, read_lists
+from weldcal.calibration.data.poses.lists import ENDINGS, PICKLED, folder_lists, read_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
@@ -25,11 +24,10 @@ from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, NEAREST_M, 
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, file_size, read_text
+from weldcal.models.files import LARGEST_NUMBER, file_size
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
 _EXTRAS = ("X_true", "img", "obj", "K", "dist", "q")
-_JOINTS = tuple(f"q{i}" for i in range(1, 10))
 LENGTHS = UNITS
 
 
@@ -100,8 +98,8 @@ def read_pairs(
     if path.is_dir() and (path / "pairs.npz").exists():
         path = path / "pairs.npz"
     mounting = None if mounting is None else mounting_name(mounting)
-    if length is not None and length not in LENGTHS:
-        raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
+    if length is not None and (length.count(",") > 1 or not set(length.split(",")) <= set(LENGTHS)):
+        raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}, or inch,mm for robot and camera.")
     try:
         return _pairs(path, *_contents(path), mounting, length, stated or StatedForms())
     except (DatasetError, InconsistentPoses):
@@ -141,13 +139,16 @@ def _pairs(
         stated = replace(
             stated, robot=replace(stated.robot, frame="base_in_flange")
         )  # easy_handeye then stores the base in the hand
-    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit))
+    arm = stated.arm or _word(path, raw, "robot")
+    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit, arm=arm))
     found_pairs = import_pairs(lists, path.name, mode, stated)
     rows_r, rows_c = found_pairs.rows
     arrays: dict[str, Array | None] = {}
     for key in _EXTRAS:
         value = raw.get(key)
         arrays[key] = None if value is None else _array(path, key, value)
+    if arrays["q"] is None and found_pairs.joints is not None and np.isfinite(found_pairs.joints).all():
+        arrays["q"] = found_pairs.joints
     for key, rows, count in (("q", rows_r, found_pairs.counts[0]), ("img", rows_c, found_pairs.counts[1])):
         listed = arrays[key]
         if listed is not None:
@@ -196,6 +197,7 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
             "mode": raw.get("configuration"),
             "unit": units.get("poses") if isinstance(units, dict) else None,
             "poses": raw.get("poses"),
+            "robot": raw.get("robot"),
         }
     file_size(path)
     ending = path.suffix.lower()
@@ -206,10 +208,7 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
             " folder."
         )
     if ending in (".pkl", ".pickle"):
-        raise DatasetError(
-            f"'{path.name}' is a pickle, which may run code: save the two arrays with numpy.savez(file, robot=...,"
-            " camera=...)."
-        )
+        raise DatasetError(PICKLED.format(path.name))
     if ending == ".npz":
         arrays = read_npz(path)
         if "hand" in arrays and "eye" in arrays:
@@ -243,11 +242,7 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
                 " samples instead. To test this result on the samples, use 'weldcal verify'."
             )
         return lists, raw
-    lists = read_lists(path)
-    raw = {}
-    if ending in (".csv", ".txt", ".tsv") and len(lists) > 1 and any("," in one.name for one in lists):
-        raw = _joint_columns(path)
-    return lists, raw
+    return read_lists(path), {}
 
 
 def _pictures(folder: Path, n: int) -> str:
@@ -279,27 +274,12 @@ def _no_lists(folder: Path) -> str:
             " into camera01.yaml ... (4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use"
             " weldcal calibrate."
         )
+    unknown = sorted({Path(n).suffix for n in names if Path(n).suffix.lower() not in ENDINGS})
+    also = f" Files {', '.join(unknown[:4])} are not read." if unknown else ""
     return (
-        f"'{folder.name}' holds no poses: give robot.csv and camera.csv, folders robot/ and camera/ with one file per"
-        " pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
+        f"'{folder.name}' holds no poses.{also} Give robot.csv and camera.csv, folders robot/ and camera/ with one file"
+        " per pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
     )
-
-
-def _joint_columns(path: Path) -> dict[str, Any]:
-    try:
-        names, rows = read_rows(path)
-    except InputError as problem:
-        first = read_text(path).lstrip("\ufeff").split("\n", 1)[0].lower()
-        if sum(bool(re.search(rf"\b{name}\b", first)) for name in _JOINTS) >= 5:
-            raise DatasetError(str(problem)) from problem
-        return {}
-    joints = [name for name in _JOINTS if name in names]
-    if len(joints) < 5:
-        return {}
-    try:
-        return {"q": [[float(row[name]) for name in joints] for row in rows]}
-    except ValueError as e:
-        raise DatasetError(f"A joint angle of '{path.name}' is not a number: {e}.") from e
 
 
 def _scalar(value: Array) -> object:

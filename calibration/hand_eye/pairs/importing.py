@@ -5,16 +5,20 @@ Find the two lists, pair their rows, and let the data choose how they are read.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.geometry.robust import Rows
 from weldcal.calibration.geometry.se3 import scaled
-from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide, order_of
 from weldcal.models.arrays import Array
 
 _MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer
@@ -37,7 +41,7 @@ it."""
 
 @dataclass(frozen=True, kw_only=True)
 class StatedForms:
-    """What the user states of the two lists: form and name of each, and the unit of lengths of both."""
+    """What the user states of the two lists: form and name of each, the unit of lengths of both, and the robot."""
 
     robot: PoseForm = field(default_factory=PoseForm)
     camera: PoseForm = field(default_factory=PoseForm)
@@ -45,6 +49,7 @@ class StatedForms:
     camera_poses: str | None = None
     unit: str | None = None
     decide: bool = True  # whether the data choose the reading: not where the file holds motions
+    arm: str | None = None  # the robot whose joint angles stand for its poses
     camera_known: bool = False  # whether the camera's poses were computed here, so that their reading is no question
 
 
@@ -68,6 +73,7 @@ class ImportedPairs:
         rows: rows (from 0) of the robot's and of the camera's list that were paired.
         counts: rows of both lists.
         metres: of the robot's unit of length.
+        joints: joint angles rad of all rows of the robot's list, or None.
     """
 
     robot: Array
@@ -75,9 +81,10 @@ class ImportedPairs:
     reading: Mapping[str, Mapping[str, object]]
     notes: tuple[str, ...]
     ids: tuple[str, ...]
-    rows: tuple[Array, Array]
+    rows: tuple[Rows, Rows]
     counts: tuple[int, int]
     metres: float
+    joints: Array | None = None
 
 
 def import_pairs(lists: list[Listing], source: str, mounting: str, stated: StatedForms) -> ImportedPairs:
@@ -95,11 +102,21 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
             camera's positions.
     """
     robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
+    robot = robot.of_arm(stated.arm)
     robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
     camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
-    rows_r, rows_c, how = together(robot, camera)
+    known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
+    notes: list[str] = []
+    try:
+        rows_r, rows_c, how = together(robot, camera)
+    except DatasetError:
+        ordered = _ordered(robot, camera, mounting) if known else None
+        if ordered is None:
+            raise
+        rows_r, rows_c, how = *ordered, ""
+        notes.append(order_words(robot, camera, *ordered))
     keep = robot.good[rows_r] & camera.good[rows_c]
-    notes = _left_out(robot, rows_r, ~keep) + _left_out(camera, rows_c, ~keep)
+    notes += _left_out(robot, rows_r, ~keep) + _left_out(camera, rows_c, ~keep)
     rows_r, rows_c = rows_r[keep], rows_c[keep]
     n = len(rows_r)
     if n == 0:
@@ -107,8 +124,17 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     a, b = [pick(one, rows) for one, rows in ((robot.readings, rows_r), (camera.readings, rows_c))]
     _check_motion(a[0], robot, "robot")
     _check_motion(b[0], camera, "camera")
-    known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
     decision, shift = decided(a, b, mounting == "eye_in_hand", n) if known else (None, 0)
+    ordered = None
+    if known and how and (shift or not (decision and decision.best.agrees)):
+        ordered = _ordered(robot, camera, mounting, sure=not shift)
+    whole = max(shift, 0) - max(-shift, 0)  # rows of the robot's list before those of the camera's
+    if ordered is not None and not (shift and (ordered[0] - ordered[1] == whole).all()):
+        rows_r, rows_c, how = *ordered, ""
+        notes.append(order_words(robot, camera, *ordered))
+        n = len(rows_r)
+        a, b = [pick(one, rows) for one, rows in ((robot.readings, rows_r), (camera.readings, rows_c))]
+        decision, shift = decided(a, b, mounting == "eye_in_hand", n)
     if decision is None:
         A, B = a[0], b[0]
         if len(a) > 1 or len(b) > 1:
@@ -154,6 +180,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         rows=(rows_r, rows_c),
         counts=(len(robot), len(camera)),
         metres=units[0][0],
+        joints=robot.joints,
     )
 
 
@@ -175,6 +202,53 @@ def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading
         if wanted.form.endswith(f",{change}"):
             found += [one.changed(change) for one in listed if f"{one.form},{change}" == wanted.form]
     return found
+
+
+def _ordered(robot: Listing, camera: Listing, mounting: str, *, sure: bool = True) -> tuple[Rows, Rows] | None:
+    """Rows of both lists that belong together by the angles of their motions; None where no order agrees.
+
+    Raises InconsistentPoses where some rows may have several partners, if ``sure``.
+    """
+    good = [np.flatnonzero(one.good) for one in (robot, camera)]
+    lists = [pick(one.readings, rows) for one, rows in zip((robot, camera), good, strict=True)]
+    found = order_of(*lists, eye_in_hand=mounting == "eye_in_hand")
+    if found is None or 2 * len(found.unclear) > len(found.first) or (found.unclear and not sure):
+        return None
+    if found.unclear:
+        raise InconsistentPoses(
+            f"The rows of '{robot.name}' and '{camera.name}' are not in the same order. The poses show the order of all"
+            f" but {_rows(robot, good[0][list(found.unclear)])} of '{robot.name}'. Number the rows of both lists alike,"
+            " or remove these."
+        )
+    return good[0][found.first], good[1][found.second]
+
+
+def order_words(robot: Listing, camera: Listing, rows_r: Rows, rows_c: Rows) -> str:
+    """Say in which order two lists belong together, and which rows have no partner."""
+    said = ""
+    moved = [(r, c) for r, c in zip(rows_r.tolist(), rows_c.tolist(), strict=True)]
+    if len(moved) > 1 and (np.diff(rows_c) == -1).all():
+        said = f"The rows of '{camera.name}' are in reverse order"
+    elif (np.diff(rows_c) < 0).any():
+        pairs = ", ".join(f"{_row(camera, c)} to {_row(robot, r)}" for r, c in moved[:12])
+        more = f" and {len(moved) - 12} more" if len(moved) > 12 else ""
+        said = f"The rows of '{camera.name}' belong to others of '{robot.name}': {pairs}{more}"
+    else:
+        said = f"The rows of '{camera.name}' are in the order of '{robot.name}', but some have no partner"
+    said += ". The angles of the motions show it."
+    for one, rows in ((robot, rows_r), (camera, rows_c)):
+        alone = np.setdiff1d(np.flatnonzero(one.good), rows)
+        if len(alone):
+            said += f" No partner: {_rows(one, alone)} of '{one.name}'."
+    return said
+
+
+def _row(listing: Listing, row: int) -> str:
+    return listing.ids[row] if listing.ids else str(row + 1)
+
+
+def _rows(listing: Listing, rows: NDArray[np.integer[Any]]) -> str:
+    return f"row{'s' if len(rows) > 1 else ''} {', '.join(_row(listing, int(k)) for k in rows)}"
 
 
 def _left_out(listing: Listing, rows: Array, out: Array) -> list[str]:
@@ -310,12 +384,13 @@ def _units(
 
     Stated units win. Else the robot's follows from its reach, and the camera's from the ratio of the motions.
     """
-    words = [robot.unit or stated.unit or "", camera.unit or stated.unit or ""]
-    for listing in (robot, camera):
-        if listing.unit and stated.unit and listing.unit != stated.unit:
+    ours, _, theirs = (stated.unit or "").partition(",")
+    units = ours, theirs or ours
+    words = [robot.unit or units[0], camera.unit or units[1]]
+    for listing, unit in zip((robot, camera), units, strict=True):
+        if listing.unit and unit and listing.unit != unit:
             raise DatasetError(
-                f"'{listing.name}' states lengths in {listing.unit}, and --unit states {stated.unit}; correct one of"
-                " them."
+                f"'{listing.name}' states lengths in {listing.unit}, and --unit states {unit}; correct one of them."
             )
     median = float(np.median(np.linalg.norm(A.X[:, :3, 3], axis=1)))
     if not words[0]:
@@ -323,10 +398,13 @@ def _units(
             words[0] = "mm"
         elif median <= _METRES_TO:
             words[0] = "m"
+        elif len(pairs := _pairs_of_units(best, median)) == 1:
+            words = [pairs[0][0], words[1] or pairs[0][1]]
         else:
             raise DatasetError(
                 f"The median distance of the robot positions of '{source}' from the base is {median:.3g}. An arm's"
-                " reach is neither that in metres nor in millimetres. State the unit with --unit m, mm, cm or inch."
+                " reach is neither that in metres nor in millimetres. State the unit with --unit m, mm, cm or inch, or"
+                " the robot's and the camera's with --unit inch,mm."
             )
     unit_r = UNITS[words[0]]
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
@@ -342,6 +420,18 @@ def _units(
     elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > LEAST_SCALE:
         _refuse_scale(ratio, words[1], source)
     return (unit_r, words[0]), (UNITS[words[1]], words[1])
+
+
+def _pairs_of_units(best: ReadingAgreement | None, median: float) -> list[tuple[str, str]]:
+    """Units of robot and camera that the ratio of the motions and the robot's reach allow."""
+    if best is None or not best.agrees:
+        return []
+    return [
+        (ours, theirs)
+        for ours, theirs in product(UNITS, UNITS)
+        if NEAREST_M < median * UNITS[ours] < FARTHEST_M
+        and abs(np.log(best.scale * UNITS[ours] / UNITS[theirs])) < _OTHER_UNIT
+    ]
 
 
 def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -> str:

@@ -42,6 +42,7 @@ _CAMERA = re.compile(
 _CAMERA_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".txt", ".npz")
 FEWEST = 4
 """Pictures with the board that are needed."""
+_CENTRAL = 0.3  # a choice: shares of width and height between which any lens has its principal point
 GROSS = 4.0  # a choice: blur and wrong boards are worse; half would drop good pictures at the rim
 """Times the median error of a picture, beyond which it does not fit the camera."""
 _K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
@@ -258,11 +259,19 @@ def _estimate(
     pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
 ) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
     if file is not None:
+        name = f" {named}" if named else ""
         if file.size is not None and file.size != size:
             raise DatasetError(
-                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, but these"
+                f"The camera file{name} is for pictures of {file.size[0]} x {file.size[1]} pixels, but these"
                 f" have {size[0]} x {size[1]}. Give the file of this resolution, or leave it out: the camera is then"
                 " estimated."
+            )
+        at = file.K[:2, 2] / size
+        if not ((at > _CENTRAL) & (at < 1.0 - _CENTRAL)).all():
+            raise DatasetError(
+                f"The camera file{name} has its principal point at ({file.K[0, 2]:.0f}, {file.K[1, 2]:.0f}), far"
+                f" from the middle of pictures of {size[0]} x {size[1]} pixels: it is for another resolution. Give the"
+                " file of this one, or leave it out: the camera is then estimated."
             )
         return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
     start = np.array(

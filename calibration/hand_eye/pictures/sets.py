@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.camera_file import CameraFile, read_camera
 from weldcal.calibration.data.poses.listing import Listing, listing_of
-from weldcal.calibration.data.poses.lists import folder_lists, together
+from weldcal.calibration.data.poses.lists import folder_lists, together, without_copies
 from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import angle_of, nearest_rotation, pose
@@ -181,15 +181,17 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
             " one row per picture, or one file per picture."
         )
     if len(lists) > 1:
-        mine = [one for one in lists if whose(one.name) == "robot"]
-        others = [one for one in lists if whose(one.name) != "camera"]
+        lists = [one for one in lists if len(one) > 1] or lists
+        mine = without_copies([one for one in lists if whose(one.name) == "robot"])
+        others = without_copies([one for one in lists if whose(one.name) != "camera"])
         lists = mine if len(mine) == 1 else others if len(others) == 1 else lists
     if len(lists) > 1:
         raise DatasetError(
             f"The names of the lists in '{folder.name}' do not show which one has the robot's poses: {known}. Name it"
             " with --robot-poses."
         )
-    return replace(lists[0], unit=lists[0].unit or unit or "")
+    one = lists[0].of_arm(stated.arm)
+    return replace(one, unit=one.unit or unit or "")
 
 
 def _imported(

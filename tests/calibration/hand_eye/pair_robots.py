@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.pair_world import (
     CAMERA,
@@ -22,6 +23,7 @@ from tests.calibration.hand_eye.pair_world import (
     every,
     row,
     text,
+    xyz,
 )
 
 
@@ -235,7 +237,81 @@ def code_lists(folder: Path) -> Path:
     return text(folder / "poses.txt", rows)
 
 
+def rsi(k: int) -> str:
+    names = " ".join(f'{n}="{v:.4f}"' for n, v in zip("XYZABC", [*ROBOT.mm[k], *ROBOT.ZYX[k]], strict=True))
+    return f'<Rob Type="KUKA"><RIst {names}/><Delay D="0"/><IPOC>{4208163634 + 4 * k}</IPOC></Rob>'
+
+
+def last_row_zero(folder: Path) -> Path:
+    seen = B.copy()
+    seen[:, 3, 3] = 0.0
+    np.savez(folder / "pairs.npz", robot=A, camera=seen)
+    return folder / "pairs.npz"
+
+
+def itk(folder: Path) -> Path:
+    for turn, name in ((ROBOT, "robot"), (CAMERA, "camera")):
+        for k in range(N):
+            text(
+                folder / name / f"T_{k:02d}.tfm",
+                ["Transform: AffineTransform_double_3_3", f"Parameters: {row(turn.R[k], turn.mm[k], mark=' ')}"],
+                "#Insight Transform File V1.0\n#Transform 0\n",
+                "FixedParameters: 0 0 0\n",
+            )
+    return folder
+
+
+def orientation_vectors(folder: Path) -> Path:
+    angles = Rotation.from_matrix(ROBOT.R).as_euler("ZYZ", degrees=True)
+    poses = [
+        {
+            "frame": {
+                "parent": "world",
+                "translation": xyz(ROBOT.mm[k]),
+                "orientation": {"type": "ov_degrees", "value": xyz(ROBOT.R[k][:, 2]) | {"th": float(angles[k, 2])}},
+            }
+        }
+        for k in range(N)
+    ]
+    beside("x.txt", [""])(folder)
+    (folder / "x.txt").unlink()
+    dump(folder / "robot.json", poses)
+    return folder
+
+
+def copies(folder: Path) -> Path:
+    """Two files with the robot's poses, in two notations."""
+    beside("robot_poses.csv", every(lambda k: row(ROBOT.p[k], ROBOT.q[k])), "x,y,z,qx,qy,qz,qw\n")(folder)
+    text(folder / "robot_backup.txt", every(lambda k: row(ROBOT.mm[k], ROBOT.v[k], mark=" ")))
+    return folder
+
+
+MOTIVE = (
+    "Format Version,1.23,Take Name,hand,Rotation Type,Quaternion,Length Units,Millimeters\n\n"
+    + ",Type" + 8 * ",Rigid Body" + "\n,Name" + 8 * ",Hand" + "\n"
+    + ",,Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error\n"
+    + "Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,\n"
+)  # fmt: skip
 ROBOTS: dict[str, Source] = {
+    "KUKA RSI lines": (beside("robot.xml", every(rsi)), HAND),
+    "a last row of zeros": (last_row_zero, HAND),
+    "ITK transforms": (itk, HAND),
+    "viam orientation vectors": (orientation_vectors, HAND),
+    "two copies of the robot's poses": (copies, HAND),
+    "Motive": (beside("robot.csv", every(lambda k: row(str(k), f"{k}.0", ROBOT.q[k], ROBOT.mm[k], 0.2)), MOTIVE), HAND),
+    "g2o": (beside("robot.g2o", every(lambda k: f"VERTEX_SE3:QUAT {k} {row(ROBOT.p[k], ROBOT.q[k], mark=' ')}")), HAND),
+    "a TCP before the waypoints": (
+        beside(
+            "robot.script",
+            every(lambda k: f"  global Waypoint_{k}_p=p[{row(ROBOT.p[k], ROBOT.v[k], mark=', ')}]"),
+            "def calib():\n  global Gripper_ToolTcp = p[0, 0, 0.215, 0, 0, 0]\n",
+        ),
+        HAND,
+    ),
+    "inch and mm": (
+        beside("robot.csv", every(lambda k: row(ROBOT.mm[k] / 25.4, ROBOT.v[k])), "x,y,z,rx,ry,rz\n"),
+        HAND,
+    ),
     "Franka O_T_EE": (beside("robot.csv", every(lambda k: row(A[k].T))), HAND),
     "KUKA DAT": (beside("robot.dat", every(kuka), "DEFDAT A\n", "ENDDAT\n"), HAND),
     "Yaskawa job, base": (

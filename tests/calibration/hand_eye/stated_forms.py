@@ -97,6 +97,12 @@ def write(form: str, X: Array, folder: Path) -> Path:
             "echo.txt",
             f"At time 0.0\n- Translation: [{x:.6f}, {y:.6f}, {z:.6f}]\n- Rotation: in Quaternion [{qx:.6f}, {qy:.6f}, {qz:.6f}, {qw:.6f}]\n",
         ),
+        "tf_static": (
+            "tf_static.txt",
+            "transforms:\n- header:\n    stamp:\n      sec: 17\n      nanosec: 0\n    frame_id: tool0\n  child_frame_id: camera\n  transform:\n"
+            f"    translation:\n      x: {x}\n      y: {y}\n      z: {z}\n    rotation:\n      x: {qx}\n      y: {qy}\n      z: {qz}\n      w: {qw}\n---\n",
+        ),
+        "pasted array": ("X.txt", "X = np.array([" + ",\n".join("[" + ", ".join(f"{v:.9f}" for v in row) + "]" for row in X) + "])\n"),
         "inverse": ("inverse.txt", "\n".join(" ".join(f"{v:.9f}" for v in row) for row in inverse)),
     }  # fmt: skip
     if form == "npy":
@@ -110,5 +116,5 @@ def write(form: str, X: Array, folder: Path) -> Path:
 FORMS = (
     "easy_handeye", "easy_handeye2", "MoveIt launch", "MoveIt 2 launch", "static transform, yaw pitch roll", "URDF", "origin excerpt",
     "OpenCV storage", "OpenCV matrix", "Kalibr", "ViSP", "matrix txt", "matrix of NumPy", "matrix JSON", "matrix mm", "quaternion",
-    "quaternion wxyz first", "quaternion with header", "UR pose", "tf2_echo", "npy",
+    "quaternion wxyz first", "quaternion with header", "UR pose", "tf2_echo", "npy", "tf_static", "pasted array",
 )  # fmt: skip

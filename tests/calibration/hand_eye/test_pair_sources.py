@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.pair_sources import NAMED, READ, REFUSED
 from tests.calibration.hand_eye.pair_world import BASE, X_BASE, A, B, X
@@ -65,3 +66,35 @@ def test_only_a_small_factor_is_a_wrong_board(tmp_path: Path, factor: float, wor
     np.savez(path, A=A, B=scaled(B, factor))
     with pytest.raises(InconsistentPoses, match=words):
         read_pairs(path, mounting="eye_in_hand")
+
+
+def test_two_units_are_stated_for_robot_and_camera(tmp_path: Path) -> None:
+    np.savez(tmp_path / "pairs.npz", robot=scaled(A, 100.0), camera=scaled(B, 100.0))  # both lists in cm
+    with pytest.raises(DatasetError, match="--unit inch,mm"):
+        read_pairs(tmp_path / "pairs.npz", mounting="eye_in_hand")
+    found = read_pairs(tmp_path / "pairs.npz", mounting="eye_in_hand", length="cm,cm")
+    assert found.robot == pytest.approx(A)
+    with pytest.raises(DatasetError, match="no unit 'inch,ell'"):
+        read_pairs(tmp_path / "pairs.npz", mounting="eye_in_hand", length="inch,ell")
+
+
+def test_a_set_tcp_and_a_forgotten_last_row_are_said(tmp_path: Path) -> None:
+    make, mounting = READ["UR program file"]
+    assert "not of the flange" not in str(read_pairs(make(tmp_path / "a"), mounting=mounting).reading)
+    lines = [
+        f"movel(p[{', '.join(f'{v:.6f}' for v in (*X[:3, 3], *Rotation.from_matrix(X[:3, :3]).as_rotvec()))}])"
+        for X in A
+    ]
+    (tmp_path / "robot.script").write_text("set_tcp(p[0,0,0.15,0,0,0])\n" + "\n".join(lines))
+    seen = B.copy()
+    seen[:, 3, 3] = 0.0
+    np.save(tmp_path / "camera.npy", seen)
+    reading = read_pairs(tmp_path, mounting="eye_in_hand").reading
+    assert "of the TCP 0,0,0.15,0,0,0, not of the flange" in str(reading["robot"]["form"])
+    assert "last row 0, 0, 0, 0 is taken as 0, 0, 0, 1" in str(reading["camera"]["form"])
+
+
+def test_objects_of_numpy_are_to_be_saved_as_arrays(tmp_path: Path) -> None:
+    np.save(tmp_path / "s.npy", np.array([{"robot": A[0]}], dtype=object), allow_pickle=True)
+    with pytest.raises(DatasetError, match=r"holds Python objects \(a pickle\), which may run code: save"):
+        read_pairs(tmp_path / "s.npy", mounting="eye_in_hand")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -57,3 +58,11 @@ def test_named_pose_is_taken_where_there_are_several(tmp_path: Path) -> None:
     X = truth()
     (tmp_path / "two.yaml").write_text(f"T_a: {X.tolist()}\nT_b: {np.linalg.inv(X).tolist()}\n")
     assert np.abs(read_stated_pose(tmp_path / "two.yaml", "T_a").readings[0].X - X).max() < 1e-9
+
+
+def test_one_of_several_cameras_is_named_by_its_serial(tmp_path: Path) -> None:
+    poses = {f"{serial}_left": {"pose": [0.9, y, 0.8, -2.77, 0.39, -0.6]} for serial, y in (("22", -0.35), ("24", 0.5))}
+    (tmp_path / "cameras.json").write_text(json.dumps(poses))
+    assert read_stated_pose(tmp_path / "cameras.json", "24_left").readings[0].X[1, 3] == pytest.approx(0.5)
+    with pytest.raises(DatasetError, match=r"holds 2 poses: 22_left, 24_left\. Name the camera's with --pose"):
+        read_stated_pose(tmp_path / "cameras.json")

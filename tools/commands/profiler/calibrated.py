@@ -251,7 +251,7 @@ def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
     """
     if len(data.readings) > 1:
         data = data.with_form(str(load_record(calibration).figures.get("robot_form", "")))
-    if len(data.readings) > 1:
+    if sum(not one.doubted for one in data.readings) > 1:
         one, other = data.readings[:2]
         raise InputError(
             f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)}"
