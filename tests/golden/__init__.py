@@ -1,0 +1,1 @@
+"""Results of weldcal that hold while its structure changes."""
