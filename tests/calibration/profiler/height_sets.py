@@ -92,7 +92,8 @@ def profile_set(rng: np.random.Generator, part: str, heights: bool, views: int =
     if mirrored:
         corners = (corners * [-1.0, 1.0])[::-1]
     edge_u = {"bar": -9.0 if side == "left" else 9.0}.get(part, 0.0)
-    profiles, poses = [], []
+    profiles: list[np.ndarray] = []
+    poses: list[np.ndarray] = []
     while len(profiles) < n:
         # the sensor above the edge: x along u, z down, then tilted, and turned about its view
         look = Rotation.from_euler("xyz", [*rng.uniform(-tilt, tilt, 2), rng.uniform(-35, 35)], degrees=True)

@@ -165,7 +165,7 @@ def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple
 def _edge(feature: str, side: str, profile: Array) -> Array:
     """Point (2,) m at which a profile crosses the edge, z away from the sensor; of one point itself."""
     if len(profile) == 1:
-        return profile[0]
+        return np.asarray(profile[0])
     return extract_edge(profile, cast(Kind, feature), cast(Literal["left", "right"], side))[0]
 
 
@@ -197,7 +197,7 @@ def _offset(
 
     def alike() -> bool:
         (a, *_), (b, *_) = found.values()
-        return abs(a.offset_s - b.offset_s) < _ALIKE * np.hypot(a.sigma_s, b.sigma_s)
+        return bool(abs(a.offset_s - b.offset_s) < _ALIKE * np.hypot(a.sigma_s, b.sigma_s))
 
     grows, words = _chosen(fits, record, total, "edge", alike)
     return *found[grows], words

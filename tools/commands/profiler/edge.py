@@ -93,15 +93,14 @@ def edge(
     guess."""
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
-    sigmas = Sigmas(
-        *(1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True)),
-        stated=any(v is not None for v in given),
-    )
+    r, x, depth = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
+    sigmas = Sigmas(r, x, depth, stated=any(v is not None for v in given))
     data = read_profiler_file(
         file, unit=unit, dataset=dataset, trial=trial, stated=PosesStated(poses, robot_form, pitch)
     )
     if not sigmas.stated and "sigma" in data.arrays:
-        sigmas = Sigmas(*(float(v) for v in data.arrays["sigma"]))
+        r, x, depth = (float(v) for v in data.arrays["sigma"])
+        sigmas = Sigmas(r, x, depth)
     shown = edge_shown(data, sigmas, feature, side, z)
     record, found = calibrate_edge(shown, sigmas, method=method, plan=plan, seed=call.seed)
     data, held = shown.file, np.zeros(0)
