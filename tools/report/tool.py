@@ -47,6 +47,7 @@ WALL_M = 0.1  # of pipe and plate beside the seam
 FLANGE_M = 0.0315  # radius of the flange: ISO 9409-1-50 has 63 mm
 GAP_M = 0.010  # a choice: a wider gap between bodies holds no washer or bracket that nobody draws
 LONGEST_M = 0.040  # from nozzle to wire point, where the file does not state it: twice a usual stick-out
+_SLOPPY_M = 5e-3  # a choice: an operator with a pointed tip misses by 1 to 3 mm (UR forum, topic 23542)
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,6 +407,11 @@ class TcpReport:
         out = ", ".join(f.wire.left_out)
         tolerance = limit_tolerance(what, larger, self.limit_mm)
         concerns = [f"Touch {out} contradicts the others and was left out: repeat it."] if out else []
+        if (most := float(np.max(f.residual_m[used], initial=0.0))) > _SLOPPY_M:
+            concerns.append(
+                f"Touch {self.touches[self.worst].id} is {1e3 * most:.1f} mm from the point of the others: repeat the"
+                " touches, or check the unit and the form of the poses."
+            )
         pose = ShownPose("X_FT", "pose of the TCP in the robot's flange F", self.X_FT)
         after = Next(f"Set it at the robot: {self.set_tcp}. Touch the point again in a new orientation.", uses=True)
         findings = Findings(tolerance=tolerance, unseen=len(held), concerns=concerns)

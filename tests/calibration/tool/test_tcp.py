@@ -185,3 +185,12 @@ def test_a_set_tcp_is_taken_off_and_its_turn_kept(tmp_path: Path) -> None:
     assert found["tcp_mm"] == pytest.approx(TCP_MM, abs=0.4)
     assert found["set_tcp"].endswith("0.000000, 0.300000, 0.000000])")
     assert np.allclose(np.array(found["X_FT"])[:3, :3], old[:3, :3])
+
+
+def test_touches_that_fit_no_point_are_a_concern(tmp_path: Path) -> None:
+    noisy, good = tmp_path / "noisy.txt", tmp_path / "good.txt"
+    noisy.write_text(ur_list(touched(np.random.default_rng(2), 6, noise_mm=8.0)))
+    good.write_text(ur_list(touched(np.random.default_rng(2), 6, noise_mm=0.5)))
+    found = [called(file, "--out", file.with_suffix(""))[1]["first_screen"]["could_be_wrong"] for file in (noisy, good)]
+    assert "from the point of the others: repeat the touches" in " ".join(found[0])
+    assert found[1] == []
