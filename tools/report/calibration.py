@@ -40,6 +40,7 @@ from weldcal.tools.report.first_screen import (
     ShownPose,
     Tolerance,
     WorkPoint,
+    first_sentence,
     limit_tolerance,
     refused_note,
     typed,
@@ -158,6 +159,8 @@ class CalibrationReport:
         """Rows: the scans that were used, the scanner's correction, and the files with the forms of robots and ROS."""
         n, left = len(self.result.poses), [name for name, _ in self.refused]
         names = f"; refused: {', '.join(left[:6])}{' ...' if len(left) > 6 else ''}" if left else ""
+        if len(left) == 1:
+            names += f" ({first_sentence(self.refused[0][1]).rstrip('.')})"
         applied = None if self.scanner is None else self.scanner.accepted
         scale = "" if applied is None else f"; the scanner is corrected by {1e2 * (applied.scale - 1.0):+.2f} %"
         return {

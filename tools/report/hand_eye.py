@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
+from weldcal.calibration.hand_eye.pairs.importing import BY_MOTION
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import CameraScale, HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import ClockOffset
@@ -64,15 +65,31 @@ class HandEyeReport:
             [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []
         )
         notes += [*repeat_note(r), *self.read_notes]
+        # a wrong scale first: no pose and no pair mends it
+        concerns = sorted(r.warnings, key=lambda text: r.scale is None or text != r.scale.sentence)
         found = Findings(
-            against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
+            against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=concerns, notes=notes
         )
         after = Next(self.advice)
-        if not self.advice:
+        if r.scale is not None:
+            after = Next(
+                "Correct the target's stated size, the focal length or the robot's unit, and run the command again. Or"
+                f" multiply the camera's positions by {r.scale.factor:.4f}."
+            )
+        elif not self.advice:
             after = Next("Record pairs that are not in the file, and verify the result with them.", uses=True)
         symbol = self.mounting.unknowns["X"].symbol
         files = {"UR and ROS 2": f"{symbol}.ur_pose.script, {symbol}.static_transform.sh"}
-        return FirstScreen(found, expected, after, shown_poses(r, self.mounting), files)
+        return FirstScreen(found, expected, after, shown_poses(r, self.mounting), self._read_as | files)
+
+    @property
+    def _read_as(self) -> dict[str, str]:
+        """A row with what the command found of the files: units that are not metres, and another order of rows."""
+        lists = self.reading.items()
+        parts = [f"{who} positions in {found['unit']}" for who, found in lists if found.get("unit", "m") != "m"]
+        if any(found.get("paired") == BY_MOTION for _, found in lists):
+            parts.append(f"rows paired {BY_MOTION} (-v: the order)")
+        return {"read as": "; ".join(parts)} if parts else {}
 
     def summary(self) -> dict[str, object]:
         """Return the JSON object of the command."""

@@ -21,6 +21,8 @@ from weldcal.calibration.geometry.se3 import scaled
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide, order_of
 from weldcal.models.arrays import Array
 
+BY_MOTION = "by their motions"
+"""How rows were paired whose order the angles of the motions show."""
 _MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer
 _FEWEST = 4  # with fewer pairs the data decide nothing
 _SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -107,13 +109,14 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
     known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
     notes: list[str] = []
+    paired = ""
     try:
         rows_r, rows_c, how = together(robot, camera)
     except DatasetError:
         ordered = _ordered(robot, camera, mounting) if known else None
         if ordered is None:
             raise
-        rows_r, rows_c, how = *ordered, ""
+        rows_r, rows_c, how, paired = *ordered, "", BY_MOTION
         notes.append(order_words(robot, camera, *ordered))
     keep = robot.good[rows_r] & camera.good[rows_c]
     notes += _left_out(robot, rows_r, ~keep) + _left_out(camera, rows_c, ~keep)
@@ -130,7 +133,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         ordered = _ordered(robot, camera, mounting, sure=not shift)
     whole = max(shift, 0) - max(-shift, 0)  # rows of the robot's list before those of the camera's
     if ordered is not None and not (shift and (ordered[0] - ordered[1] == whole).all()):
-        rows_r, rows_c, how = *ordered, ""
+        rows_r, rows_c, how, paired = *ordered, "", BY_MOTION
         notes.append(order_words(robot, camera, *ordered))
         n = len(rows_r)
         a, b = [pick(one, rows) for one, rows in ((robot.readings, rows_r), (camera.readings, rows_c))]
@@ -163,6 +166,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
             "reading": one.form,
             "rows": len(listing),
             "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out],
+            "paired": paired or how,
         }
         for who, listing, one, unit in (("robot", robot, A, units[0][1]), ("camera", camera, B, units[1][1]))
     }
