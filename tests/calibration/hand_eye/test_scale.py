@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from tests.calibration.hand_eye.scale_sets import QUICK, independent_sigma, name
 from weldcal.calibration.hand_eye.mistakes import _scale_fit, wrong_scale
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import solve_ax_xb, solve_problem
+from weldcal.tools.commands.hand_eye import run_hand_eye
 
 
 @pytest.mark.parametrize("n", [8, 10, 12, 20])
@@ -63,3 +66,19 @@ def test_motions_name_the_scale_as_well() -> None:
     found = wrong_scale(problem, solve_ax_xb(A, B, QUICK), QUICK)
     assert found is not None
     assert found.factor == pytest.approx(1.0 / 1.04, abs=0.01)
+
+
+def test_the_first_screen_names_a_wrong_scale_first(tmp_path: Path) -> None:
+    F, G, _ = pairs(np.random.default_rng(3), 12, 1.0 / 0.97, 0.05, 0.3)
+    np.savez(tmp_path / "pairs.npz", A=F, B=G, mode="eye_in_hand")
+    first = run_hand_eye("ax-yb", tmp_path / "pairs.npz", tmp_path / "out", limit_mm=1.0).first
+    assert first.concerns[0].startswith("The camera's distances seem")
+    assert first.next.text.startswith("Correct the target's stated size")
+
+
+def test_the_first_screen_states_another_order_and_unit(tmp_path: Path) -> None:
+    F, G, _ = pairs(np.random.default_rng(3), 12, 1.0, 0.05, 0.3)
+    G[:, :3, 3] *= 1000.0 / 25.4
+    np.savez(tmp_path / "pairs.npz", A=F, B=np.roll(G, 5, axis=0)[::-1], mode="eye_in_hand")
+    first = run_hand_eye("ax-yb", tmp_path / "pairs.npz", tmp_path / "out").first
+    assert first.more["read as"] == "camera positions in inch; rows paired by their motions (-v: the order)"
