@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
-from weldcal.models.files import require_whole
+from weldcal.models.files import UNFINISHED, require_whole
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.recording.player import Playback
@@ -165,7 +165,7 @@ def _run(
     return str(cell.job.command(root).phase), X_BC
 
 
-PAGES = ("report.html", "recording.html", "seams.html", "tool.html")
+PAGES = ("report.html", RECORD_HTML, "recording.html", "seams.html", "tool.html")
 
 
 @command("view", common=LOOK, short_help="Show the report and the 3D recording of a finished run.")
@@ -176,11 +176,12 @@ def view(
         bool, switch("--browser/--no-browser", "Open the pages, or only print their paths.", show_default="browser")
     ] = True,
 ) -> Outcome:
-    """Show a finished run again: its 3D recording and its report; of a weld that was killed, how to go on."""
-    note, record = killed_weld(result) if result.is_dir() else "", (result / RECORD_HTML).resolve()
-    if note and not record.exists():
+    """Show a run again: its 3D recording and its report; of a broken weld also how to go on."""
+    note = killed_weld(result) if result.is_dir() else ""
+    if note and not any((result / name).exists() for name in PAGES):
         raise InputError(note)
-    pages = [record] if note else find_pages(result)
+    killed = bool(note) and (result / UNFINISHED).exists()  # a report there is that of an earlier run
+    pages = [(result / RECORD_HTML).resolve()] if killed else find_pages(result)
     if note:
         console.emit_warning(note)
     opened = browser and open_pages(pages)

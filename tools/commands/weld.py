@@ -106,7 +106,7 @@ def by_hand(scenario: Scenario) -> str:
 
 
 def killed_weld(folder: Path) -> str:
-    """Write the record of a weld whose last run was killed; how far it came and how to go on, "" for any other folder.
+    """Return how far a broken weld came and how to go on, "" for any other folder; write the record of a killed one.
 
     Raises:
         InputError: the weld still runs.
@@ -117,10 +117,11 @@ def killed_weld(folder: Path) -> str:
         return ""
     if (process := writer(folder)) is not None:
         raise InputError(f"The weld in '{folder}' still runs (process {process}): wait until it has ended.")
-    if progress.done or progress.ends[-1] not in (KILLED, POWER):
+    if progress.done:
         return ""
+    killed = progress.ends[-1] in (KILLED, POWER)
     scenario, here = load_scenario(str(folder / RESTART / SCENARIO)), "Before its first arc"
-    if progress.stretches:
+    if progress.stretches and killed:
         progress.write(folder)
         part_record(scenario.welding.order, None, progress, folder).write(folder)
     if progress.stretches and progress.stretches[-1].run == len(progress.ends) - 1:
@@ -129,7 +130,8 @@ def killed_weld(folder: Path) -> str:
             last.weld_pass
         )
     way_on = by_hand(scenario) or f"Go on with {typed('weld --resume', folder)}"
-    return f"{here} this run was {progress.ends[-1]}. {way_on}"
+    ended = f"was {progress.ends[-1]}." if killed else f"ended: {progress.ends[-1].rstrip('.')}."
+    return f"{here} this run {ended} {way_on}"
 
 
 def restarting(restart: Restart) -> dict[str, Replacement]:

@@ -220,7 +220,7 @@ class PartRecord:
         limited = self.order.limits != OrderLimits()
         tone, judged = ("good", "pass, within all limits") if limited else ("plain", "not judged, no limits ordered")
         if self.outside:
-            tone, judged = "bad", f"fail, {len(self.outside)} of the limits exceeded"
+            tone, judged = "bad", f"fail, {len(self.outside)} of the limits not met"
         if ended not in ("", DONE) or not seams:
             tone, judged = "bad", "fail, the weld is not complete"
         who = f"Part {self.order.part or 'not named'}, operator {self.order.operator or 'not named'}"

@@ -252,7 +252,7 @@ def test_the_files_of_a_record_hold_order_figures_and_pictures(tmp_path: Path) -
     PartRecord(order=order, log=record, seams=(only(record),), plots={(1, 1): plot}).write(tmp_path)
     page = (tmp_path / "record.html").read_text()
     assert "Record of the weld of part 0711" in page
-    assert "Part 0711, operator not named: fail, 1 of the limits exceeded; 1 seam welded" in page
+    assert "Part 0711, operator not named: fail, 1 of the limits not met; 1 seam welded" in page
     assert page.count('<svg class="plot') == 1
     assert not re.search(r'(src|href)="(?!data:|#)', page), "it needs no other file"
     with (tmp_path / "record.csv").open(newline="") as table:

@@ -89,7 +89,10 @@ def tool_check(
         write_atomic(folder / "tool.png", picture)
         write_atomic(folder / "tool.html", tool_report(check, picture))
         rows = check.rows() if call.verbose else {key: check.rows()[key] for key in ("torch", "tip", "least pipe")}
-        made, again = typed("new my_cell --tool-file", file), f"Correct {file}, then:\n{typed('tool check', file)}"
+        made, again = (
+            typed(f"new {shlex.quote(file.stem + '_cell')} --tool-file", file),
+            f"Correct {file}, then:\n{typed('tool check', file)}",
+        )
         last = {"next": again if check.contradictions else made, "page": f"{folder / 'tool.html'} (-v prints all here)"}
         told = {f"note {k + 1}": text for k, text in enumerate(check.contradictions)} | rows | last
         return Outcome(check.summary(), text=partial(emit_summary, f"tool check: {check.verdict}", told))
