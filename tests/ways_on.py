@@ -46,7 +46,7 @@ OTHERS = (
     "hand-eye axb-ycz pairs.npz",
     "profiler sphere sphere.npz --limit-mm 0.01 --out profiler_missed",
     "profiler seam groove.npz --calibration my-profiler --limit-mm 0.01 --out seam_missed",
-    "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --limit-mm 0.01 --out tablet_missed",
+    "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --seen seen.csv --limit-mm 0.01 --out tablet_missed",
     "doctor my-calibration",
     "new my_clamp --part clamp.stl",
     "new my_cell --part bracket.step --edges 99",

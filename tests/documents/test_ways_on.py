@@ -29,7 +29,7 @@ ONE_OF_EACH = (
     "hand-eye ax-yb pairs.npz --limit-mm 0.01 --out hand_missed",
     "hand-eye ax-yb two_robots.npz",
     "profiler sphere sphere.npz --out my-profiler",
-    "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --limit-mm 0.01 --out tablet_missed",
+    "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --seen seen.csv --limit-mm 0.01 --out tablet_missed",
     "apply my-calibration my_scans/clouds/pose03.npz scan_C.ply",
     "export my-calibration --ros2 my_scanner_tf",
     "import my_scans --out imported",

@@ -77,7 +77,8 @@ def _result(folder: Path, result: CalibrationResult) -> Path:
 def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(verified: VerifyReport) -> None:
     d = verified.summary()
     figures = {"position_error_mm", "tilt_deg", "per_pose", "warnings"}
-    assert set(d) == {"state", "verdict", "limit_mm", "reason"} | figures
+    offset = {"X", "off_mm", "off_xyz_mm", "off_sigma_mm", "off_deg", "new", "notes"}
+    assert set(d) == {"state", "verdict", "limit_mm", "reason"} | figures | offset
     assert d["verdict"] == "use with care"  # because the orientations hardly vary
     # nine scans: without one of them the others decide against the correction, and that held-out error sets the limit
     assert d["limit_mm"] == pytest.approx(verified.result.held_out_mm["p95"])
@@ -137,8 +138,8 @@ def test_the_correction_of_a_result_is_applied_to_what_the_scanner_saw(
         tmp_path / "corrected", replace(plain, scanner_correction={"scale": 1.01, "gradient_per_m": [0.02, -0.03]})
     )
     before, after = (verify_dataset(r, few, tmp_path / f"out-{r.name}") for r in (bare, corrected))
-    assert any("holds no scanner correction" in w for w in before.warnings)
-    assert not any("holds no scanner correction" in w for w in after.warnings)
+    assert any("holds no scanner correction" in w for w in (*before.warnings, *before.notes))
+    assert not any("holds no scanner correction" in w for w in (*after.warnings, *after.notes))
     for o, p in zip(before.observations, after.poses, strict=True):
         x, y, _ = o.p_CR
         moved = plain.X_BC @ (o.p_CR * (1.01 + 0.02 * x - 0.03 * y))

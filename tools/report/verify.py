@@ -124,7 +124,8 @@ class VerifyReport:
         more: dict[str, str] = {}
         if (o := self.offset) is not None:
             words = f"{judged.words}, from these scans alone"
-            poses.append(ShownPose(f"{judged.symbol}, new solution", words, o.new.X_BC))
+            name = f"{judged.symbol}, new solution"
+            poses.append(ShownPose(name, words, o.new.X_BC, aside=v.verdict != DO_NOT))
             x, y, z = (f"{1e3 * v:+.3f}" for v in o.shift_m)
             more["off by"] = (
                 f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"

@@ -132,7 +132,8 @@ class PairsReport:
         poses = [ShownPose(f"{unknown.symbol}, judged", f"{words}, as RESULT states it", as_transform(j.X))]
         if j.new is not None:
             name = f"{unknown.symbol}, new solution"
-            poses.append(ShownPose(name, f"{words}, from these pairs alone", j.new.X))
+            aside = self.verdict.verdict != DO_NOT
+            poses.append(ShownPose(name, f"{words}, from these pairs alone", j.new.X, aside=aside))
         return FirstScreen(
             Findings(settled=settled, notes=self.notes, concerns=self.warnings), expected, self._next(), tuple(poses)
         )

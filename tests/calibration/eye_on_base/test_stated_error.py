@@ -210,8 +210,8 @@ def test_the_terminal_prints_the_verdict_and_the_pose(tmp_path: Path) -> None:
     judged = CliRunner().invoke(app, ["verify", str(result), str(new), "--out", str(tmp_path / "out")])
     found = load_result(result).X_BC
     x, y, z = 1e3 * found.translation()
-    for run in (made, judged):
-        assert f"X_BC {x:.3f}, {y:.3f}, {z:.3f} mm; rotation vector" in " ".join(run.stdout.split())
+    for run, symbol in ((made, "X_BC"), (judged, "X_BC, judged")):
+        assert f"{symbol} {x:.3f}, {y:.3f}, {z:.3f} mm; rotation vector" in " ".join(run.stdout.split())
     assert judged.stdout.startswith("verify: use it")
     every = CliRunner().invoke(app, ["verify", str(result), str(new), "--out", str(tmp_path / "all"), "-v"])
     text = " ".join(every.stdout.split())
