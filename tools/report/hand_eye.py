@@ -127,14 +127,12 @@ class HandEyeReport:
         )
 
     def text(self) -> str:
-        """What is printed before the first screen: directions, sketch, uncertainty, comparison.
+        """What is printed before the first screen: directions, sketch, held-out errors, comparison.
 
         The first screen has the poses themselves, the warnings and the next pose.
         """
         r, m = self.result, self.mounting
         lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
-        for k in r.poses:
-            lines.append(f"one sigma    {m.unknowns[k].symbol}  {_sigma_words(r, k)}")
         lines += [f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():
             lines += [f"             {_held_out(held_out_used(r), 'without outliers, ')}"]
