@@ -81,7 +81,7 @@ def test_the_true_torch_weaves_as_ordered(weave: str, period_s: float, tmp_path:
     # judged against the ordered weave, and as fast along the seam as ordered
     assert found["torch_mean_mm"] < 0.1  # type: ignore[operator]
     assert found["welded_mm"] == pytest.approx(80.0, abs=1.5)
-    assert "Weave, measured" in (tmp_path / "run" / "report.html").read_text()
+    assert "Weave of seam 1, measured" in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_a_weave_that_the_arm_cannot_do_is_refused_before_any_motion() -> None:

@@ -10,6 +10,7 @@ from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import PathError
 
 SETTLED_PERIODS = 1.5  # a choice: the weave grows over the first, and the servo learns the arm's lag
+_MIDDLE_PERIODS = 4.0  # a choice: between the knots of the swings' middle; the wave means out over as many
 _HALF_WAY = 0.5  # a choice: of the amplitude, on both sides of which a crossing counts
 
 
@@ -41,7 +42,8 @@ def measure_weave(time: Array, error: PathError, period_s: float, plane_rad: flo
         return None
     t, s = time[rows], error.s[rows]
     side = math.cos(plane_rad) * error.lateral[rows] + math.sin(plane_rad) * error.height[rows]
-    side = side - 0.5 * (side.max() + side.min())
+    side = side - _middle(t, side, period_s)
+    side = side - 0.5 * (side.max() + side.min())  # a dwell on one side moves the mean
     starts = _rising(t, side)
     if len(starts) < 3:
         return None
@@ -55,6 +57,15 @@ def measure_weave(time: Array, error: PathError, period_s: float, plane_rad: flo
     bow = -float(np.linalg.lstsq(A, s[whole], rcond=None)[0][0])
     period = float(starts[-1] - starts[0]) / swings
     return MeasuredWeave(amplitude_m=amplitude, period_s=period, swings=swings, bow_m=bow)
+
+
+def _middle(t: Array, side: Array, period_s: float) -> Array:
+    """The middle (N,) of the swings: the torch follows the felt seam, which leaves the planned line under the arc."""
+    knots = np.linspace(t[0], t[-1], 2 + int(np.ptp(t) / (_MIDDLE_PERIODS * period_s)))
+    hats = np.column_stack([np.interp(t, knots, hat) for hat in np.eye(len(knots))])
+    phase = 2.0 * np.pi / period_s * np.outer(t, (1, 2, 3))
+    A = np.column_stack([hats, np.sin(phase), np.cos(phase)])
+    return np.asarray(hats @ np.linalg.lstsq(A, side, rcond=None)[0][: len(knots)])
 
 
 def _rising(t: Array, side: Array) -> Array:

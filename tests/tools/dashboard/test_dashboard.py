@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,16 @@ def page(source: DashboardSource, view: Meshcat) -> Iterator[Dashboard]:
     dashboard = Dashboard(source, view.web_url(), share=True)
     yield dashboard
     dashboard.close()
+
+
+def run_takes_seconds_for_each_of_its_own(
+    source: DashboardSource, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    """Let the source's wall clock, and no other, follow the run: the time left is then that of the wall clock."""
+    begun = time.monotonic()
+    clock = SimpleNamespace(monotonic=lambda: begun + seconds * source.live.moment.time)
+    monkeypatch.setattr("weldcal.tools.dashboard.source.time", clock)
+    source.values()  # the clock begins here
 
 
 def opened(browser: Browser, url: str, state: str) -> None:
@@ -235,8 +246,14 @@ def test_end_asks_once_more_and_escape_holds(browser: Browser, page: Dashboard, 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_what_a_person_needs_is_on_the_page_at_every_size(
-    browser: Browser, page: Dashboard, source: DashboardSource, size: str, tmp_path: Path
+    browser: Browser,
+    page: Dashboard,
+    source: DashboardSource,
+    size: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    run_takes_seconds_for_each_of_its_own(source, monkeypatch, 1.5)
     browser.resize(*SIZES[size])
     calibrating(source.live)
     opened(browser, page.url, "RUNNING")
@@ -247,13 +264,13 @@ def test_what_a_person_needs_is_on_the_page_at_every_size(
         "pose02: not used, no flange in the scan",
         "pose05",
         "3 scans",
-        "about 38 s left",
+        "about 57 s left",  # 1.5 times 3 scans of 4 s, a seam of 20 s and 6 s home
     ):
         assert words in text.lower(), words
     assert browser.run("return document.querySelectorAll('#plot_error circle').length") == 2
     welding(source.live)
     browser.wait("document.getElementById('seam').textContent.startsWith('50 of 100 mm, torch on')")
-    for words in ("the torch is 0.04 mm beside", "0.06 mm", "1.90 mm", "8.0 mm/s", "about 12 s left"):
+    for words in ("the torch is 0.04 mm beside", "0.06 mm", "1.90 mm", "8.0 mm/s", "about 18 s left"):
         assert words in browser.text().lower(), words
     assert "Steering margin" not in browser.text()
     welding(source.live, sigma_min=0.04)

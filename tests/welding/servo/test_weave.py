@@ -149,13 +149,15 @@ def test_each_limit_grows_with_its_own_power_of_the_frequency() -> None:
     assert largest_frequency_hz(weave, [Bound(1, 1.0, 1000.0)]) == 5.0
 
 
-def test_a_weave_is_measured_as_it_was_made() -> None:
-    """A shape, period, drift and noise that the measure does not know of."""
+@pytest.mark.parametrize("off_mm_s", [(0.0, 0.0), (0.3, 0.3), (-0.6, 0.4)])
+def test_a_weave_is_measured_as_it_was_made(off_mm_s: tuple[float, float]) -> None:
+    """A shape, period, drift and noise that the measure does not know of; the felt seam leaves the planned line."""
     t = np.arange(0.0, 9.0, 0.008)
     phase, rng = 2.0 * np.pi * 1.1 * t, np.random.default_rng(1)
     side = 1.7 * np.sin(phase) + 0.15 * np.sin(3.0 * phase)
     s = 8.0 * t - 0.4 * side**2 / np.ptp(side) ** 2 * 4.0
-    error = PathError(MM * s, MM * (side + 0.03 + 0.003 * rng.standard_normal(len(t))), np.full(len(t), -0.02 * MM))
+    path = 0.03 + np.interp(t, [0.0, 4.0, 9.0], np.cumsum([0.0, 4.0 * off_mm_s[0], 5.0 * off_mm_s[1]]))
+    error = PathError(MM * s, MM * (side + path + 0.003 * rng.standard_normal(len(t))), np.full(len(t), -0.02 * MM))
     found = measure_weave(t, error, 0.92, 0.0)
     assert found is not None
     assert found.amplitude_m == pytest.approx(0.5 * MM * np.ptp(side), rel=0.01)
