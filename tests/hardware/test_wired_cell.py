@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +223,13 @@ def test_the_record_has_the_arc_that_the_world_had(welded: tuple[DemoResult, dic
     (seam,) = result.record.seams  # type: ignore[union-attr]
     assert seam.arc_s == pytest.approx(truth["arc_on_s"], abs=0.1)
     assert seam.welded_mm == pytest.approx(truth["welded_mm"], abs=0.5)
-    assert {file.name for file in (result.folder / "pictures").iterdir()} == {"seam_1_start.png", "seam_1_end.png"}
+    (piece,) = result.record.pieces  # type: ignore[union-attr]
+    assert (piece.name, piece.run, piece.ended) == ("1", 1, "done")
+    assert piece.to_mm - piece.from_mm == pytest.approx(truth["welded_mm"], abs=0.5)
+    assert datetime.fromisoformat(piece.start) < datetime.fromisoformat(piece.end), "of the wall's clock"
+    document = json.loads((result.folder / "record.json").read_text())
+    assert [one["arc_mm"] for one in document["seams"]] == [[[piece.from_mm, piece.to_mm]]]
+    assert {file.name for file in result.folder.glob("record.*")} == {"record.html", "record.json", "record.csv"}
 
 
 def structure(diagram: Diagram, without: set[str]) -> tuple[set[str], set[tuple[str, str, str, str]]]:

@@ -162,7 +162,7 @@ class PartRecord:
             found.append(_row("pass, to the left and up, mm", Spread(), 1, offsets))
         for tack in seam.tacks:
             where = f"tack at {tack['from_mm']:g} to {tack['to_mm']:g} mm"
-            found.append(_row(f"{where}: travel angle, deg", tack["travel_angle_deg"], 1))
+            found.append(_row(f"{where}: travel angle under the lifted tip, deg", tack["travel_angle_deg"], 1))
             found.append(_row(f"{where}: {_WORDS['path_mm'][0]}, mm", tack["path_mm"], 2))
         return found
 

@@ -47,7 +47,8 @@ class WeldedSeam:
         angles: of the wire against the seam, deg.
         welded_mm: of the union of arc_mm, where that is known.
         arc_mm: where along the whole seam the arc burned, (from, to) of each piece.
-        tacks: place of each ordered tack, with the travel angle and the path about it.
+        tacks: place of each ordered tack, the arc's travel angle while the tip is lifted over it, and the torch's path
+            at it.
         weave: mean half width and frequency, as measured of the longest piece; None: not woven, or too short.
     """
 
@@ -245,13 +246,17 @@ def ordered(record: WeldRecord, numbers: Numbers) -> Mapping[str, Any]:
 
 
 def _tacks(record: WeldRecord, numbers: Numbers, on: NDArray[np.intp]) -> Iterator[dict[str, Any]]:
-    place = place_mm(record)[on]
+    torch = place_mm(record)[on]
+    tip = torch + 1e3 * (record["s_tip_m"] - record["s_torch_m"])[on]  # a chord ahead: a root is welded forwards
     for tack in ordered(record, numbers).get("tacks", ()):
-        near = on[(place > tack["from_mm"] - TACK_NEAR_MM) & (place < tack["to_mm"] + TACK_NEAR_MM)]
+        near, under = (
+            on[(place > tack["from_mm"] - TACK_NEAR_MM) & (place < tack["to_mm"] + TACK_NEAR_MM)]
+            for place in (torch, tip)
+        )
         yield {
             "from_mm": tack["from_mm"],
             "to_mm": tack["to_mm"],
-            "travel_angle_deg": _extent(np.degrees(record["travel_angle_rad"][near])),
+            "travel_angle_deg": _extent(np.degrees(record["travel_angle_rad"][under])),
             "path_mm": _extent(1e3 * np.hypot(record["e_t_m"][near], record["e_height_m"][near])),
         }
 

@@ -54,6 +54,21 @@ def only(record: WeldRecord) -> WeldedSeam:
 TWO_SPEEDS = [0.010] * 250 + [0.005] * 251
 
 
+def test_a_tacks_angle_is_taken_where_the_tip_is_lifted() -> None:
+    """The tip is 59 mm ahead of the torch: over a tack at 80 mm the torch is at 21 mm."""
+    mm = np.arange(101.0)
+    angle = np.where(np.abs(mm + 59.0 - 80.0) < 10.0, 6.0, np.where(np.abs(mm - 80.0) < 10.0, 1.0, 0.0))
+    columns = {"s_seam_m": 1e-3 * mm, "s_torch_m": 1e-3 * mm, "s_tip_m": 1e-3 * (mm + 59.0)}
+    columns |= {"travel_angle_rad": np.radians(angle)}
+    record = log([0.010] * 101, **{name: column.tolist() for name, column in columns.items()})
+    tacks = [{"from_mm": 76.0, "to_mm": 84.0}, {"from_mm": 28.0, "to_mm": 36.0}]
+    record.settings["ordered"] = [{"seam": 1, "pass": 1, "tacks": tacks}]
+    late, early = only(record).tacks
+    assert (late["travel_angle_deg"].least, late["travel_angle_deg"].most) == pytest.approx((0.0, 6.0))
+    assert np.isnan(early["travel_angle_deg"].most), "the tip was lifted before the arc was lit"
+    assert early["path_mm"].most == 0.0
+
+
 def test_set_values_give_the_heat_of_each_stretch() -> None:
     found = only(log(TWO_SPEEDS))
     heat, speed = found.figures["heat_input_kJ_mm"], found.figures["speed_mm_s"]
