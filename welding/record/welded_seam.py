@@ -135,7 +135,7 @@ def arc_pieces(record: WeldRecord, plans: Sequence[Numbers]) -> list[ArcPiece]:
     arcs, found = record.settings.get("arcs", ()), []
     for (seam, weld_pass), rows in seam_rows(record, plans):
         of_pass = burns(record, np.flatnonzero(rows & record.arc))
-        for burn, later in zip(of_pass, [*of_pass[1:], None], strict=True):
+        for burn, later in zip(of_pass, [*of_pass[1:], None], strict=False):  # without a burn there is no piece
             s, arc = place[burn], arcs[number[burn[0]]] if number[burn[0]] < len(arcs) else {"run": 1}
             if later is not None and number[later[0]] == number[burn[0]]:
                 arc = arc | {"ended": "the power source reported no arc"}

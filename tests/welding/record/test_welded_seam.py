@@ -108,6 +108,12 @@ def test_the_record_states_where_the_arc_burned() -> None:
     assert found.welded_mm == pytest.approx(16.0, abs=0.2)
 
 
+def test_a_log_without_an_arc_has_no_piece() -> None:
+    dark = log([0.010] * 100, s_torch_m=(1e-4 * np.arange(100)).tolist())
+    dark.columns["torch_on"][:] = 0.0
+    assert arc_pieces(dark, [(0, 0)]) == []
+
+
 def test_what_is_welded_twice_counts_once() -> None:
     """A run from 0 to 40 mm, one that was lost from 32 to 60 mm, and one backwards from 100 to 52 mm."""
     first, last = (
