@@ -108,8 +108,8 @@ class DemoResult:
             found = Findings(
                 against=against,
                 no_tolerance=(
-                    "No scenario key states how far the torch may be off the true seam: compare the error below with what"
-                    " your joint allows."
+                    "No scenario key states how far the torch may be off the true seam: compare the error below with"
+                    " what your joint allows."
                 ),
                 concerns=self.warnings,
                 notes=self.arm_note,
