@@ -84,7 +84,7 @@ def test_monitor_reports_the_knock(recording: tuple[Path, Path], tmp_path: Path)
     found = CliRunner().invoke(
         app, ["monitor", str(moving), "--calibration", str(calibration), "--recalibrate", "--out", str(out), "--json"]
     )
-    assert found.exit_code == 0, found.output
+    assert found.exit_code == 1, found.output  # the verdict is "do not use"
     result = json.loads(found.stdout.strip().splitlines()[-1])
     assert list(result)[-4:] == ["rms_mm", "frames", "dropped", "drift"]
     assert (result["frames"], result["dropped"]) == (FRAMES - 1, 1)
