@@ -209,7 +209,7 @@ class Walk:
             before = set(self.folder.rglob("*.html"))
             after = self._run(line)
             self._judge(path[-1], after, path)
-            if after.code == 1 and after.err == ran.err:
+            if after.code == 1 and after.err and after.err == ran.err:
                 self.ways.append(Way(path[-1], line, "it says the same again"))
             if after.code == 2:
                 continue
