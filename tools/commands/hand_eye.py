@@ -313,13 +313,8 @@ def run_hand_eye(
         refined = _refined(pairs, config, said, optional=optional)
         if refined is not None and refined.accepted:
             adopted = True
-            result = replace(
-                refined.result,
-                labels=found.labels,
-                equation=found.equation,
-                warnings=result.warnings,
-                scale=result.scale,
-            )
+            of_poses: dict[str, Any] = {"warnings": result.warnings, "scale": result.scale}
+            result = replace(refined.result, labels=found.labels, equation=found.equation, **of_poses)
             pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
             problem = problem_of_pairs(pairs)
     if refine is not None and arm is not None:
@@ -499,9 +494,6 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
                 m, problem.F, problem.G, most=most_compared(len(problem.F)), observation=ours.observation
             )
             whole = bool(np.isfinite(held.translation).all())
-            rows.append(
-                MethodRow(
-                    m, held.rms_deg if whole else float("nan"), 1e3 * held.rms_translation if whole else float("nan")
-                )
-            )
+            errors = (held.rms_deg, 1e3 * held.rms_translation) if whole else (float("nan"), float("nan"))
+            rows.append(MethodRow(m, *errors))
     return tuple(rows)
