@@ -80,7 +80,7 @@ NAMED_FILE = re.compile(r"\b(?:[Ss]ee|in|to|report|written to) +([\w./-]+\.(?:ht
 LOOSE = re.compile(r"\bweldcal [a-z][a-z-]+(?: [a-z][a-z-]+)?")  # in a sentence, without quotes
 COMMANDS = {name.split()[0] for name in typer.main.get_command(app).commands}  # type: ignore[attr-defined]
 PLACEHOLDER = re.compile(r"(?<![\w./-])[A-Z][A-Z_]{3,}(?![\w./-])")
-MADE = {"scaled_scans": lambda path: write_scans(path, 12, 0, 1.003)}  # beside those of the pages
+MADE = {"scaled_scans": lambda path: write_scans(path, 12, 0, scale=1.003)}  # beside those of the pages
 NO_FILES_OF_RESULTS = ("dataset.yaml", "poses.csv", "scenario.yaml", "cell.yaml")  # of the user, by their names
 
 
