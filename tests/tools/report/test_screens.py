@@ -159,7 +159,7 @@ def test_calibrate_says_how_many_scans_and_where_the_forms_are(shown: dict[str, 
     text = of(shown, "calibrate my_scans --out my-calibration").text
     assert "scans used 12 of 12; the scanner is " in text
     assert "UR and ROS 2 ur_pose.script, static_transform.sh" in text
-    assert calibration().first.more["scans used"].startswith("9 of 10; refused: p99;")
+    assert calibration().first.more["scans used"].startswith("9 of 10; refused: p99 (No flange was found);")
 
 
 @pytest.mark.parametrize("name", PAGES)
