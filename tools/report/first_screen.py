@@ -307,8 +307,8 @@ class FirstScreen:
     @property
     def notes(self) -> tuple[str, ...]:
         """List at most three things that do not speak against the result; the third counts the others."""
-        doubts = self.found.concerns if self.verdict == USE else ()  # of a verdict by another rule
-        return _first_few(text for text in (*doubts, *self.found.notes) if text not in self.concerns)
+        concerns = self.found.concerns if self.verdict == USE else ()  # of a verdict by another rule
+        return _first_few(text for text in (*concerns, *self.found.notes) if text not in self.concerns)
 
     @property
     def nothing(self) -> str:

@@ -206,7 +206,7 @@ GENERATED = [
         ([], ["Held."], ["Held.", "Lost."]),
         (None, WITHIN, ABOVE, UNKNOWN),
         (None, 0, 3, 8),
-        ([], ["A doubt."], [f"Doubt {k}." for k in range(5)]),
+        ([], ["A concern."], [f"Concern {k}." for k in range(5)]),
         ([], ["A note."], [f"Note {k}." for k in range(5)]),
         (None, (USE, "By its rule."), (CARE, "By its rule."), (DO_NOT, "By its rule.")),
     )
