@@ -52,7 +52,7 @@ class Broken:
             at_m,
             kind,
             -math.inf,
-            Progress(scenario="", seed=0, robot=None, scenario_sha256="", folders=("",)),
+            Progress(scenario="", seed=0, robot=None, scenario_sha256=""),
         )
 
     def __call__(

@@ -127,7 +127,6 @@ def test_a_scanner_beside_the_arm_that_shows_too_little_names_the_other_cell(tmp
             "A scanner beside the arm has one view",
         ),
         ("carried_scanner", "job: {calibrate: true}", "needs its pose there"),
-        ("carried_scanner", "job: {X_FC: null}", "needs its pose there"),
         (
             "carried_scanner",
             "planning: {scan_poses_deg: [[0, -80, 110]]}",
