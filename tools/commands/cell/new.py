@@ -261,7 +261,7 @@ def offered(
                 some = [seams[k] for k in chosen]
                 scenario.workpiece = dc.replace(spec, seams=some, joint=kind, pose_guess=pose)
                 _loaded(path, scenario)
-                if reason := add_scan_poses(scenario, path, "" if places else next(iter(reasons.values()))):
+                if reason := add_scan_poses(scenario, path) if places else next(iter(reasons.values())):
                     reasons |= {id: reason for seam in some for id in seam.edges if places or not apart}
                 else:
                     scans = scenario.planning.scan_poses_deg

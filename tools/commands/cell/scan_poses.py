@@ -37,34 +37,28 @@ CARRIED = "carried_scanner"
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TRIED_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
+NO_END = 1.2  # times what a scanner shows: a longer part has no end in view, and is not looked for
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
-def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
+def add_scan_poses(scenario: Scenario, path: Path) -> str:
     """Write scan poses of a scanner on the flange into a scenario, or say why a scan does not show the part.
 
     Args:
         scenario: the scenario; its part lies where the arm can weld it.
         path: its file.
-        reason: why it cannot be welded; "" where it can.
-
-    Returns:
-        The reason; another one where the scanner is the cause.
     """
     loaded = load_scenario(str(path))
     assert loaded.workpiece is not None
     assert scenario.workpiece is not None
     loaded.workpiece.pose_guess = scenario.workpiece.pose_guess
-    carried = loaded.carried_scanner() is not None and loaded.workpiece.located_by == "scan"
-    if carried == bool(reason):
-        return reason
+    if loaded.carried_scanner() is None or loaded.workpiece.located_by != "scan":
+        return ""
     try:
         station = make_station(loaded, 0)
     except WeldcalError as error:
-        return reason or str(error)
+        return str(error)
     try:
-        if not carried:
-            return _too_long(loaded, station) or reason
         poses = scan_poses(loaded, station)
     except WeldcalError as error:
         return str(error)
@@ -74,19 +68,14 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
     return ""
 
 
-def _too_long(scenario: Scenario, station: Station) -> str:
-    """Say why one scan beside the arm does not show a part that the arm could weld; "" where size is not the cause."""
-    cad, X_BP = _part(scenario, station)
-    scanner, planning = scenario.scanner, seam_planning(scenario, station, servo_config(scenario, station))
-    refused = plan_drawn_seam(dc.replace(planning, advises=False), 0).reason is not None
-    if refused or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
-        return ""
-    away = float(np.linalg.norm(X_BP @ (0.5 * cad.mesh.bounds.sum(axis=0)) - np.array(scanner.xyz_m)))
+def _too_long(part: TriMesh, X_BP: RigidTransform, scanner: RenderedScanner, up: Array, beyond: float = 1.0) -> str:
+    """Say that a part is longer than what a scanner beside the arm shows, by a factor; "" where it is not."""
+    away = float(np.linalg.norm(X_BP @ (0.5 * part.bounds.sum(axis=0)) - np.array(scanner.xyz_m)))
     shown = max(scanner.scanner().footprint_m(away))
-    size = _lying(cad.mesh.transformed(X_BP), station.arm.up)[1][0]
+    size = _lying(part.transformed(X_BP), up)[1][0]
     words = f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it"
     advice = f"Let the arm carry the scanner along the part: weldcal new FOLDER --part FILE --from {CARRIED}."
-    return "" if size <= shown else f"{words}. {advice}"
+    return "" if size <= beyond * shown else f"{words}. {advice}"
 
 
 def _part(scenario: Scenario, station: Station) -> tuple[WeldPart, RigidTransform]:
@@ -324,6 +313,8 @@ def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseCon
     middle = guess.pose() @ (0.5 * part.mesh.bounds.sum(axis=0))
     shift = 1e-3 * placed.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
     X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess.pose()
+    if longer := _too_long(part.mesh, X_BP, scanner, station.arm.up, NO_END):
+        return longer
     low, high = PLACE_M - np.array(TRIED_M), PLACE_M + np.array(TRIED_M)
     z = scenario.calibration.table_z_m
     table = extrude(np.array([low, (high[0], low[1]), high, (low[0], high[1])]), z - 0.02, z)
@@ -334,7 +325,8 @@ def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseCon
     planning = dc.replace(
         seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=False
     )
-    return plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason or ""
+    reason = plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason
+    return "" if reason is None else _too_long(part.mesh, X_BP, scanner, station.arm.up) or reason
 
 
 def standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
