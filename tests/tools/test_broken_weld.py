@@ -126,6 +126,14 @@ def test_a_folder_says_how_far_a_killed_weld_came(broken: Path) -> None:
         killed_weld(broken)
 
 
+def test_a_second_pass_that_was_killed_has_a_page(broken: Path) -> None:
+    first = Stretch(seam=0, piece=0, run=0, from_m=0.0, to_m=0.141, done=True, time="2026-11-27T10:00:00+00:00")
+    second = replace(first, weld_pass=1, to_m=0.030, done=False)
+    state(broken, stretches=(first, second), p_BCrater=np.zeros(3)).write(broken)
+    assert "At 30 mm of seam 1, pass 2, this run was cut off" in killed_weld(broken)
+    assert "the arc broke off at 30 mm in run 1" in (broken / "record.html").read_text()
+
+
 def test_a_joined_record_is_the_same_in_all_its_files(broken: Path) -> None:
     """A run that was stopped at 41 mm, one that was killed at 60 mm, and the one that went on at 52 mm."""
     runs = [log([0.010] * n, s_seam_m=(1e-3 * (a + np.arange(float(n)))).tolist()) for a, n in ((0.0, 42), (52.0, 90))]

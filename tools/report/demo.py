@@ -159,13 +159,10 @@ class DemoResult:
         refined = refinement is not None and refinement.arm is not None
         arm = "What the refinement leaves of the arm's errors" if refined else "Errors of an arm as its maker leaves it"
         advice = "" if refined else " Calibrate with calibration.refine: links."
-        return (
-            (
-                f"Along this seam the tool turns by up to {np.degrees(plan.arm_turn_rad):.0f} deg between the tip and"
-                f" the torch at the same place. {arm} then put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the"
-                f" seam that the tip felt.{advice}"
-            ),
-        )
+        turn_deg = f"{np.degrees(plan.arm_turn_rad):.0f}"
+        turns = f"Along this seam the tool turns by up to {turn_deg} deg between the tip and the torch at one place. "
+        put = f"{arm} put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the seam that the tip felt.{advice}"
+        return (turns * (turn_deg != "0") + put,)
 
     def _lead(self) -> str:
         if self.record is None or not self.record.seams or self.state != "done":

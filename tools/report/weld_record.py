@@ -157,7 +157,7 @@ class PartRecord:
         if weave := order.get("weave"):
             for key, words in (("amplitude_mm", f"weave ({weave['shape']}), mm"), ("frequency_hz", "weave, Hz")):
                 found.append(_row(words, Spread(mean=(seam.weave or {}).get(key, math.nan)), 2, fixed(weave[key], 2)))
-        if seam.weld_pass > 1:
+        if seam.weld_pass > 1 and order:  # not known of a killed run
             offsets = f"{order['lateral_mm']:g} and {order['vertical_mm']:g}"
             found.append(_row("pass, to the left and up, mm", Spread(), 1, offsets))
         for tack in seam.tacks:

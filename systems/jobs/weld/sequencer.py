@@ -109,8 +109,8 @@ def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
         )
     return (
         f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it"
-        f" expects {status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a"
-        " better scanner."
+        f" expects {status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans"
+        " (calibration.maximum_scans), a larger error (calibration.required_error_mm), or use a better scanner."
     )
 
 
