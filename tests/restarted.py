@@ -394,7 +394,7 @@ ENDED = {"sigint": "Ctrl-C", "kill": "killed", "power": "power was lost", "pause
 
 def recorded(kind: str, passes: int, at: tuple[int, float], seed: int, place: Path) -> tuple[float, list[str]]:
     """Break a weld off, go on with it where that is possible, and judge its record; the worst end in mm, and faults."""
-    folder, wrong = place / "weld", []
+    folder, wrong, went_on = place / "weld", [], passes == 1 or kind == "pause"
     status, result = apart(lambda: logged_run(ordered_weld(passes), folder, seed, 1, kind, at))
     if kind in ("kill", "power"):
         if status != signal.SIGKILL:
@@ -404,6 +404,9 @@ def recorded(kind: str, passes: int, at: tuple[int, float], seed: int, place: Pa
                 file.write(b"[0, 0, 0, 0.0")
         _, said = apart(lambda: after_power(kind == "power", lambda: killed_weld(folder)))
         advice = "weld the rest by hand" if passes > 1 else f"Go on with weldcal weld --resume {folder}"
+        if said is not None and "Before its first arc" in said and not (folder / "record.json").exists():
+            off = max(b - a for pieces in burned(folder, passes) for a, b in pieces)
+            return off, [] if off < UNION_MM else ["it lost an arc"]  # power was lost while the arc was lit
         if said is None or ENDED[kind] not in said or advice not in said or "mm of seam 1" not in said:
             wrong.append(f"view says: {said}")
     if kind != "pause" and passes == 1:
@@ -416,13 +419,17 @@ def recorded(kind: str, passes: int, at: tuple[int, float], seed: int, place: Pa
 
         _, result = apart(lambda: after_power(kind == "power", again))
         if result is None or result["state"] != "done":
-            return math.inf, [*wrong, f"it did not go on: {result and result.get('reason')}"]
+            reason = str((result or {}).get("reason"))
+            went_on, result = False, None
+            wrong += [] if "weld it by hand" in reason else [f"it did not go on: {reason}"]
+    if not (folder / "record.json").exists():
+        return math.inf, [*wrong, "there is no record"]
     record = json.loads((folder / "record.json").read_text())
     wrong += disagreements(folder, result)
     cut = [piece for piece in record["pieces"] if piece["ended"] != "done"]
     if [ENDED[kind] in piece["ended"] for piece in cut] != [True] or len(record["broke_off"]) != 1:
         wrong.append(f"pieces: {record['pieces']}")
-    elif (passes == 1 or kind == "pause") != ("went on at" in record["broke_off"][0]):
+    elif went_on != ("went on at" in record["broke_off"][0]):
         wrong.append(f"it says: {record['broke_off']}")
     truth = [pieces for pieces in burned(folder, passes) if pieces]
     stated = [merged(seam["arc_mm"]) for seam in record["seams"]]

@@ -107,6 +107,17 @@ class Listing:
         name = f"{self.name.partition(',')[0]}, {self.ids[k]}"
         return replace(self, name=name, numbers=numbers, ids=(self.ids[k],), times=None, left_out=left_out, joints=None)
 
+    def of_joints(self) -> "Listing":
+        """Return the list of its joint angles alone, which stand for the robot's poses."""
+        return Listing(
+            name=f"{self.name.partition(',')[0]}, joints",
+            numbers=(),
+            ids=self.ids,
+            times=self.times,
+            form="joint angles",
+            joints=self.joints,
+        )
+
     def of_arm(self, arm: str | None) -> "Listing":
         """Return the list with the flange's poses of an arm where it holds joint angles alone.
 

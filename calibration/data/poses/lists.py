@@ -211,6 +211,8 @@ def two_lists(
     many = [one for one in lists if len(one) > 1]
     if robot is None and camera is None and len(many) > 1:
         lists = many  # a pose alone beside lists is a result
+    if len(lists) == 1 and lists[0].numbers and lists[0].joints is not None:
+        return lists[0].of_joints(), replace(lists[0], joints=None)
     known = ", ".join(repr(one.name) for one in lists[:8]) or "none"
     chosen: dict[str, Listing] = {}
     for who, key in (("robot", robot), ("camera", camera)):

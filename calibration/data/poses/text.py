@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.names import JointColumns, PoseColumn, columns_of, distinct, joint_columns, whose
+from weldcal.calibration.data.poses.names import PoseColumn, columns_of, distinct, joint_columns, whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -372,16 +372,15 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
         times = times * 1e-9 if np.isfinite(times).any() and float(np.nanmax(times)) > _NANOSECONDS else times
         times = times if np.isfinite(times).all() else None
     prefixes = sorted({c.prefix for c in columns}, key=[c.prefix for c in columns].index)
-    found = []
+    found, joints = [], joint_columns(header)
     for prefix in prefixes:
         mine = [c for c in columns if c.prefix == prefix]
-        label = name if len(prefixes) == 1 else f"{name}, {prefix or 'other'}"
-        found.append(_columns(label, mine, table, ids, times))
-    joints = joint_columns(header)
+        alone = len(prefixes) == 1 and not (joints and prefix)
+        found.append(_columns(name if alone else f"{name}, {prefix or 'other'}", mine, table, ids, times))
     robots = [one for one in found if whose(one.name) != "camera"]
     if not joints or (robots and float(np.nanmax(np.abs(table[:, joints[0].indices]), initial=0.0)) > _MOST_TURNS_DEG):
         return found
-    q, words = _joints(joints[0], table, name)
+    q, words = joints_rad(table[:, joints[0].indices], joints[0].unit, name)
     if not robots:
         bad = np.flatnonzero(~np.isfinite(q).all(axis=1))
         left_out = tuple((int(k), "A joint angle is missing or not finite.") for k in bad)
@@ -391,14 +390,16 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     return [replace(one, joints=q) if one in robots else one for one in found]
 
 
-def _joints(columns: JointColumns, table: Array, name: str) -> tuple[Array, str]:
-    """Joint angles (n, joints) rad, NaN where there is none, and a phrase. Raises DatasetError for no angles."""
-    q = table[:, columns.indices]
+def joints_rad(q: Array, unit: str, name: str) -> tuple[Array, str]:
+    """Joint angles (n, joints) rad, NaN where there is none, and a phrase; ``unit``: deg, rad, or empty.
+
+    Raises DatasetError for no angles.
+    """
     largest = float(np.nanmax(np.abs(q), initial=0.0))
     if not np.isfinite(largest) or largest > _MOST_TURNS_DEG:
         raise DatasetError(f"'{name}' has a joint angle of {largest:.6g}: write angles in degrees or radians.")
-    degrees = columns.unit == "deg" or (columns.unit != "rad" and largest > _TURN_RAD)
-    if columns.unit == "rad" and largest > _TURN_RAD:
+    degrees = unit == "deg" or (unit != "rad" and largest > _TURN_RAD)
+    if unit == "rad" and largest > _TURN_RAD:
         raise DatasetError(f"'{name}' states joint angles in rad, and one is {largest:.4g}: they look like degrees.")
     return np.radians(q) if degrees else q, f"joint angles in {'degrees' if degrees else 'radians'}"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array, looks_like_poses
 from weldcal.calibration.data.poses.names import columns_of, natural
-from weldcal.calibration.data.poses.text import table_lists
+from weldcal.calibration.data.poses.text import joints_rad, table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import as_number
@@ -30,6 +30,7 @@ _NO_POSES = re.compile(
     r"(?i)^(q|joint.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection"
     r"|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
 )
+_JOINTS = re.compile(r"(?i)^(q|.*joints?|.*joint_?(angle|position|value|state)s?(_?(deg|rad))?)$")
 _VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
 _QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|^ori|wxyz|xyzw)")
 _POSITION = re.compile(r"(?i)^(.*_)?(position|translation|xyz|pos|trans|tvec|t|p|location)$")
@@ -38,10 +39,36 @@ _POSITION = re.compile(r"(?i)^(.*_)?(position|translation|xyz|pos|trans|tvec|t|p
 def lists_of_tree(tree: Any, name: str) -> list[Listing]:
     """Return every list of poses of a tree of mappings, lists and arrays; the key path follows the name.
 
+    Joint angles stand for the poses where there are none, and beside one list belong to its rows.
+
     Raises:
         DatasetError: a node has the form of poses and holds none.
     """
-    return list(_collect(tree, name, ""))
+    found = list(_collect(tree, name, ""))
+    joints = _joints(tree, name) if len(found) < 2 else None
+    if joints is None or (found and len(found[0]) != len(joints[0])):
+        return found
+    if found:
+        return [replace(found[0], joints=joints[0])]
+    return [Listing(name=name, numbers=(), joints=joints[0], form=joints[1])]
+
+
+def _joints(tree: Any, name: str) -> tuple[Array, str] | None:
+    """Joint angles (n, 5 to 7) rad under a key of a mapping, or of each of its samples, and a phrase.
+
+    None where there are none.
+    """
+    node = next((v for v in tree.values() if _is_samples(v)), tree) if isinstance(tree, Mapping) else tree
+    keys = node[0] if _is_samples(node) else node if isinstance(node, Mapping) else {}
+    for key in (k for k in keys if _JOINTS.match(str(k))):
+        q = _array([one.get(key) for one in node] if _is_samples(node) else node[key])
+        if q is not None and q.ndim == 2 and len(q) > 1 and 5 <= q.shape[1] <= 7 and np.isfinite(q).all():
+            return joints_rad(q, next(iter(re.findall("(?i)(deg|rad)$", str(key))), "").lower(), name)
+    return None
+
+
+def _is_samples(node: Any) -> bool:
+    return isinstance(node, list) and bool(node) and all(isinstance(one, Mapping) for one in node)
 
 
 def _collect(node: Any, name: str, at: str) -> Iterator[Listing]:

@@ -221,7 +221,7 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
             next((str(_scalar(arrays[k])) for k in keys if k in arrays and np.size(arrays[k]) == 1), "")
             for keys in (("mode", "configuration"), ("unit",))
         )
-        return lists_of_tree({k: v for k, v in arrays.items() if k not in raw}, path.name), raw
+        return lists_of_tree({k: v for k, v in arrays.items() if k not in raw or k == "q"}, path.name), raw
     if ending in (".yml", ".yaml", ".json", ".xml", ".samples", ".calib"):
         tree = read_tree(path)
         raw = (

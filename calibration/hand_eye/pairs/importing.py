@@ -36,6 +36,7 @@ SCALE_SIGMA = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
 _OTHER_SIZE = 2.0  # a choice: no board is measured wrong by a factor of 7
 _SQUARES_M = (0.005, 0.2)  # a choice: sizes of a board's squares, which some programs count
+_OWN_RAD = 0.005  # a choice: 0.3 deg, more than the errors of an arm turn its flange
 LEAST_SCALE = 0.2  # a choice: 20 %, beyond a board's wrong scale, within a factor of unit
 """Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
 it."""
@@ -105,6 +106,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     """
     robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
     robot = robot.of_arm(stated.arm)
+    _check_own(robot, camera)
     robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
     camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
     known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
@@ -186,6 +188,20 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         metres=units[0][0],
         joints=robot.joints,
     )
+
+
+def _check_own(robot: Listing, camera: Listing) -> None:
+    """Raise DatasetError where the poses beside a robot's joint angles are those of its flange or tool."""
+    if robot.joints is None or len(robot) != len(camera) or robot.name.rpartition(", ")[2] != "joints":
+        return
+    R = robot.readings[0].X[:, :3, :3]
+    for one in camera.readings:
+        tool = np.swapaxes(R, 1, 2) @ one.X[:, :3, :3]
+        if float(np.abs(tool[camera.good] - tool[camera.good][:1]).max(initial=0.0)) < _OWN_RAD:
+            raise DatasetError(
+                f"The poses in '{camera.name}' are those of the joint angles beside them, and the camera's are"
+                " missing: give these as a second list."
+            )
 
 
 def _with_name(listing: Listing, form: PoseForm) -> PoseForm:

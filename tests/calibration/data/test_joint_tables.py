@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.calibration.data.pose_texts import MATRICES, TEXTS, N, P, Q
 from weldcal.calibration.data.clouds import save_cloud
@@ -131,6 +134,47 @@ def test_pairs_take_the_robots_poses_from_joint_angles(tmp_path: Path) -> None:
     assert found.q == pytest.approx(ANGLES, abs=1e-6)
     with pytest.raises(InputError, match="no arm 'ur99'"):
         read_pairs(tmp_path, mounting="eye_in_hand", stated=StatedForms(arm="ur99"))
+
+
+SEEN = np.linalg.inv(POSES) @ MATRICES[0]
+
+
+def beside(header: str, X: Array) -> str:
+    rows = np.hstack([np.degrees(ANGLES), X[:, :3, 3], Rotation.from_matrix(X[:, :3, :3]).as_quat()])
+    return HEADERS["j"] + f",{header}\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in rows)
+
+
+WRITTEN: dict[str, Callable[[Path], object]] = {
+    "unnamed.csv": lambda file: file.write_text(beside("x,y,z,qx,qy,qz,qw", SEEN)),
+    "named.csv": lambda file: file.write_text(
+        beside(",".join(f"cam_{k}" for k in ("x", "y", "z", "qx", "qy", "qz", "qw")), SEEN)
+    ),
+    "letters.npz": lambda file: np.savez(file, q=ANGLES, B=SEEN),
+    "words.npz": lambda file: np.savez(file, joint_angles_deg=np.degrees(ANGLES), T_cam_target=SEEN),
+    "samples.json": lambda file: file.write_text(
+        json.dumps([{"joints": q.tolist(), "T_cam_board": X.tolist()} for q, X in zip(ANGLES, SEEN, strict=True)])
+    ),
+    "lists.json": lambda file: file.write_text(
+        json.dumps({"joint_positions": ANGLES.tolist(), "marker_poses": SEEN.tolist()})
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_joint_angles_and_camera_poses_of_one_file_are_pairs(name: str, tmp_path: Path) -> None:
+    WRITTEN[name](tmp_path / name)
+    with pytest.raises(DatasetError, match="name the arm by --robot"):
+        read_pairs(tmp_path / name, mounting="eye_in_hand")
+    found = read_pairs(tmp_path / name, mounting="eye_in_hand", stated=StatedForms(arm="ur10e"))
+    assert found.robot == pytest.approx(POSES, abs=1e-6)
+    assert found.camera == pytest.approx(SEEN, abs=1e-6)
+    assert found.q == pytest.approx(ANGLES, abs=1e-6)
+
+
+def test_poses_of_the_tool_beside_its_joint_angles_are_no_pairs(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(beside("x,y,z,qx,qy,qz,qw", POSES @ MATRICES[1]))
+    with pytest.raises(DatasetError, match="are those of the joint angles beside them"):
+        read_pairs(tmp_path / "log.csv", mounting="eye_in_hand", stated=StatedForms(arm="ur10e"))
 
 
 @pytest.mark.parametrize("header", ["x,y,z,qx,qy,qz,qw,u,v", "x,y,z,rx,ry,rz,e,theta", "u,v,x,z"])

@@ -70,7 +70,7 @@ FILES = {
 }
 CELL, UNFINISHED, SCHEMA = "cell.yaml", "unfinished.yaml", "cell.schema.json"
 WIDTH = 120
-MOST_SCANS = 20  # of a cell with an own part; a public saddle's 12 scans left 0.172 mm of 0.150, 0.172 sqrt(12/20) = 0.133
+MOST_SCANS = 20  # with an own part: a saddle of a stranger had 0.172 mm after 12, and 0.172 sqrt(12 / 20) = 0.133
 LEFT_OUT = ("extends", "visualization")
 HEAD = """# yaml-language-server: $schema={schema}
 {state}
