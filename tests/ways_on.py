@@ -239,6 +239,9 @@ class Walk:
         places = [self.folder, ROOT, *self.folder.glob("weldcal-out/*")]
         out = re.search(r"(\S+)/report\.html", ran.printed)
         places += [self.folder / out[1]] if out else []
+        places += [
+            self.folder / Path(word).parent for word in ran.printed.split() if "/" in word
+        ]  # named with its folder
         return sorted(text for text in texts if ran.code == 0 and not any((p / text).exists() for p in places))
 
     def _unusable(self, text: str) -> str:
