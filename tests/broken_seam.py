@@ -17,12 +17,12 @@ from unittest.mock import patch
 
 import numpy as np
 
+from tests.worlds.weld import plant
+from tests.worlds.weld.budgets import BUDGETS, NOMINAL, Budget, planned_seam
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, arcs, corner, s_curve
 from weldcal.systems.jobs.weld.progress_keeper import EVERY_M, felt_points
 from weldcal.systems.jobs.weld.seam_planning import RUN_UP_S
-from weldcal.tools.worlds.weld import plant
-from weldcal.tools.worlds.weld.budgets import BUDGETS, NOMINAL, Budget, planned_seam
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner, s_curve
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import path_error
 from weldcal.welding.record.progress import Progress, Stretch, load_progress

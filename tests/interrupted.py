@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.worlds.doctor import write_cell
 from weldcal.models.files import UNFINISHED
-from weldcal.tools.worlds.doctor import write_cell
 
 STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does
 MARK = "WELDCAL_INTERRUPTED"

@@ -26,7 +26,7 @@ from weldcal.tools.report.run import RunOptions
 
 SEED = 5  # its planned poses lie near each other
 # The first 30 mm of the S groove, calibrated from as few scans as there may be; the scanner has noise and no other
-# error, and the arm is exact: as in `weldcal.tools.worlds.scaled_arms`.
+# error, and the arm is exact: as in `tests.worlds.scaled_arms`.
 SHORT_JOB = """
 robot: !SimulatedUr {repeatability_mm: 0.0, kinematic_error_mm: 0.0}
 scanner: !RenderedScanner

@@ -2,7 +2,7 @@
 
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the
 Bayesian information criterion (fit.py). The difference must exceed a threshold for each cause, and the disturbance a
-size that matters. The thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its
+size that matters. The thresholds were fixed on simulated sets (tests/worlds/doctor.py), other ones than those that its
 false alarms are counted on.
 """
 

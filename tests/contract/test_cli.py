@@ -19,10 +19,9 @@ import typer.main
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
-from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.cli.app import MOVED, PANELS, app
+from weldcal.tools.cli.app import PANELS, app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
@@ -75,8 +74,6 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
         "weldcal check-cell",
         "weldcal robots",
         "weldcal schema",
-        "weldcal mutate",
-        "weldcal dev mutate",
         "weldcal apply",  # its argument is the file that it writes
     )
     assert name in only_look or {"--out", "--seed"} <= options
@@ -163,7 +160,6 @@ def test_with_json_a_mistake_is_json_too(tmp_path: Path) -> None:
         ["hand-eye", "ax-yb", "poses.csv"],
         ["profiler", "sphere", "scans.npz"],
         ["tablet", "calibrate", "touches.csv"],
-        ["benchmark", "flange"],
     ],
 )
 @pytest.mark.parametrize("place", ["file/result", "file", "/proc/result"])
@@ -253,7 +249,6 @@ def test_ctrl_c_ends_with_130_and_one_sentence(capsys: pytest.CaptureFixture[str
         ),
         (["weld", "--robot", "emulatd"], "There is no robot 'emulatd': did you mean 'emulated'?"),
         (["hand-eye", "ax-yb", "poses.csv", "--robot", "ur10ee"], "There is no arm 'ur10ee'; did you mean 'ur10e'?"),
-        (["benchmark", "part-welds", "--part", "bracke"], "There is no part 'bracke': did you mean 'bracket'?"),
     ],
 )
 def test_a_slip_of_the_keyboard_gets_the_nearest_name(
@@ -384,12 +379,3 @@ def test_results_become_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
         "ids": ["a", "b"],
         "nothing": None,
     }
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_a_study_that_is_a_test_now_says_how_it_is_run(name: str) -> None:
-    found = CliRunner().invoke(app, ["dev", "benchmark", name])
-    assert found.exit_code == 2
-    assert MOVED[name] in " ".join(found.output.split())
-    *_, place = MOVED[name].split()
-    assert (ROOT / (place if "/" in place else place.replace(".", "/") + ".py")).exists()

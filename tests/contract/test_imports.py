@@ -138,7 +138,7 @@ OFFENDERS = (
     ("calibration/offender.py", "from weldcal.welding import numerics", "Imports point one way"),
     ("calibration/geometry/offender.py", "from weldcal.calibration.data import clouds", "Inside calibration"),
     ("tools/report/offender.py", "from weldcal.tools.commands import calibrate", "Inside tools"),
-    ("systems/offender.py", "from weldcal.tools.studies import harness", "Imports point one way"),
+    ("systems/offender.py", "from weldcal.tools.cli import app", "Imports point one way"),
 )
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.figures import mutate
+from tests.figures.mutate import KILLED, LIST, SURVIVED, Mutation, read_mutations, run_mutations
 from tests.places import ROOT
 from weldcal.models.errors import InputError
-from weldcal.tools.commands import mutate
-from weldcal.tools.commands.mutate import KILLED, LIST, SURVIVED, Mutation, read_mutations, run_mutations
 
 MUTATIONS = read_mutations(LIST.read_text())
 

@@ -7,6 +7,8 @@ import shlex
 import sys
 from dataclasses import dataclass
 
+from tests.places import ROOT
+
 ROBOT, EMULATED = "192.168.56.101", "127.30.0.9"  # the robot of the pages, and the emulated one in its place
 
 # Commands that take less than some seconds and start no simulation, by their first words.
@@ -134,4 +136,6 @@ class CommandLine:
 
 def process(arguments: list[str]) -> list[str]:
     """The command of a process of its own."""
+    if arguments[:1] == ["figures"]:
+        return ["env", f"PYTHONPATH={ROOT}", sys.executable, "-P", "-m", "tests.figures", *arguments[1:]]
     return [sys.executable, "-P", "-m", "weldcal.tools", *arguments]

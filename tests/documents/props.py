@@ -19,6 +19,7 @@ from tests.calibration.tool import torches
 from tests.documents.scans import write_scans, write_wrist_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
+from tests.worlds.touch import touch_world
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.touch.touches import touches_text
@@ -29,7 +30,6 @@ from weldcal.models.mesh import extrude
 from weldcal.models.scanners import get_scanner
 from weldcal.models.tools.loading import WELDING
 from weldcal.tools.commands.cell.new import write_cell
-from weldcal.tools.worlds.touch import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])
@@ -86,20 +86,20 @@ def _two_robots(path: Path) -> None:
 
 
 def _bracket(path: Path) -> None:
-    from weldcal.tools.worlds.parts.step_parts import PARTS, write_step
+    from tests.worlds.parts.step_parts import PARTS, write_step
 
     write_step(PARTS["bracket"]().shape, path)
 
 
 def _beam(path: Path) -> None:
     """A T of two solids, 1 m long."""
-    from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
+    from tests.worlds.parts.step_parts import assembly, box, write_step
 
     write_step(assembly(box((0, -50, 0), (1000, 100, 8)), box((0, -4, 8), (1000, 8, 92))), path)
 
 
 def _bracket_scan(path: Path) -> None:
-    from weldcal.tools.worlds.parts.scans import scan_scene, subject
+    from tests.worlds.parts.scans import scan_scene, subject
 
     scene = scan_scene(subject("bracket").mesh, get_scanner("phoxi_m", width=412, height=308), 0)
     np.savez(path, points_B=scene.cloud_B, eye_B=scene.eye_B)

@@ -14,6 +14,7 @@ import pytest
 
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import LOCKSTEP_S, emulator_process
+from tests.worlds.robot.bench import Bench, CommandThread
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault
@@ -22,7 +23,6 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.tools.emulators.ur.controller.registers import RuntimeState
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, STREAM_PACKAGES, Lockstep
 from weldcal.tools.emulators.ur.wire.net import LinkFaults
-from weldcal.tools.worlds.robot.bench import Bench, CommandThread
 
 BOUND_S = 0.5
 FRAME_S = 0.002

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 import pytest
 
 from tests.ur_rtde import NEEDS_UR_RTDE
+from tests.worlds.robot.bench import Bench
+from tests.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, FaultCase
+from tests.worlds.robot.fault_run import recover, run_case, run_sequence
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
-from weldcal.tools.worlds.robot.bench import Bench
-from weldcal.tools.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, FaultCase
-from weldcal.tools.worlds.robot.fault_run import recover, run_case, run_sequence
 
 CASES = [case for case in RUNNING + AT_START if case.short]
 

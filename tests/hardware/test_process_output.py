@@ -14,6 +14,8 @@ import pytest
 from tests.hardware.emulator_process import run_client
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
 from tests.ur_rtde import NEEDS_UR_RTDE
+from tests.worlds.robot.bench import Bench
+from tests.worlds.robot.fault_run import recover
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused
@@ -28,8 +30,6 @@ from weldcal.tools.emulators.ur.controller.registers import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version
-from weldcal.tools.worlds.robot.bench import Bench
-from weldcal.tools.worlds.robot.fault_run import recover
 
 OUTPUT, VALVE = 3, 4
 FEED, VOLTAGE = Level(0, True, 0.4), Level(1, False, 0.75)

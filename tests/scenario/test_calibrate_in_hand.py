@@ -18,6 +18,8 @@ from typer.testing import CliRunner
 
 from tests.documents.scans import WRIST_POSES, write_wrist_scans
 from tests.documents.scans import X_FC as X_WRIST
+from tests.worlds.flange_frames import flange_frame
+from tests.worlds.moves import TargetInHand, observed_frames
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
@@ -32,8 +34,6 @@ from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.mounting_live import calibrate_carried
-from weldcal.tools.worlds.flange_frames import flange_frame
-from weldcal.tools.worlds.moves import TargetInHand, observed_frames
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"

@@ -13,6 +13,8 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.worlds.flange_frames import empty_frame, flange_frame
+from tests.worlds.moves import cube_moves, observed_frames
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.data.results import load_result
@@ -24,8 +26,6 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate_motion import calibrate_motion
-from weldcal.tools.worlds.flange_frames import empty_frame, flange_frame
-from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 SECONDS = 6.0
 FLANGE = "iso9409-1-50-4-m6"

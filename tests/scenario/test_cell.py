@@ -13,6 +13,7 @@ import pytest
 
 from tests.conftest import FinishedRun, run_weldcal
 from tests.short_job import ShortJob
+from tests.worlds.weld.case import figures
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
@@ -33,7 +34,6 @@ from weldcal.tools.commands.run import JobRun
 from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
-from weldcal.tools.worlds.weld.case import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
@@ -100,7 +100,7 @@ def test_the_torch_keeps_to_a_seam_that_the_plan_got_wrong(short_job: DemoResult
 def test_what_the_tip_felt_is_the_seam_to_hundredths(short_job: DemoResult) -> None:
     found = figures(short_job, "s_groove", "guarded", 5)
     assert found.completed
-    # The targets of `weldcal reproduce cell`; the offsets are small because the seat is derived and the tag zeroed, not
+    # The targets of `figures reproduce cell`; the offsets are small because the seat is derived and the tag zeroed, not
     # because anything was fitted to this groove: the tag's picture is half a percent too large, 0.01 mm of 2 mm and
     # 0.03 mm of 40 mm less.
     assert found.point_sd_mm <= 0.02

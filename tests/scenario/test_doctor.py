@@ -12,10 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.places import SHARED_DATA, needs
+from tests.worlds.doctor import COLUMNS, HEADER, write_cell
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.doctor import weld_causes
-from weldcal.tools.worlds.doctor import COLUMNS, HEADER, write_cell
 
 AUBO = SHARED_DATA / "flange" / "aubo_i5_phoxi_s"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.worlds.scaled_arms import ARMS, arm_scenario
 from weldcal.calibration.planning.clearance import arm_bodies, lowest_point, self_distance
 from weldcal.models.arms.kinematics import link_frames, load_arm
 from weldcal.models.robots import get_robot
@@ -17,7 +18,6 @@ from weldcal.models.tools.loading import WELDING
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import run_weld
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.scaled_arms import ARMS, arm_scenario
 
 HANGING = """
 arm: ur5e

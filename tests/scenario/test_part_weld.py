@@ -13,12 +13,12 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.worlds.parts.cells import PartTrial, write_cell
+from tests.worlds.parts.step_parts import PARTS, MadePart, assembly, box
 from weldcal.models.mesh import extrude, merge
 from weldcal.models.workpieces.part import Part
 from weldcal.systems import station
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS, MadePart, assembly, box
 
 
 def test_two_fillets_are_welded_one_after_the_other_from_a_step_file(tmp_path: Path) -> None:

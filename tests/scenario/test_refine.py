@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from tests.calibration.eye_on_base.test_tcp import _pairs
 from tests.calibration.refinement.test_local_field import _scans
+from tests.worlds.wrong_models import station
 from weldcal.calibration.data.results import load_result, save_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
@@ -25,7 +26,6 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.worlds.wrong_models import station
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
+from tests.worlds.parts.cells import PartTrial, write_cell
+from tests.worlds.parts.step_parts import PARTS
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.scenario.loading import load_scenario
@@ -25,8 +27,6 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.commands.weld import known_camera, run_scenario
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS
 
 PASSES = [
     PassOrder(lateral_mm=-2.0, vertical_mm=3.0),

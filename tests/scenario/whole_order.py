@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 from tests.calibration.tool.torches import Wrong, cell
+from tests.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.calibration.data.results import CalibrationResult, save_result
 from weldcal.calibration.tool.comparison import measured_file, tool_text
 from weldcal.calibration.tool.measure import measure_tool
@@ -26,7 +27,6 @@ from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.tools.emulators.cell.process import CELL, PLAYED_HOST, PLAYED_SCANS, WORLD, X_BC, played_world
-from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 BENT_M, TILTED_RAD = 1.5e-3, 0.01  # of the torch against the shipped tool file
 POWER_PORT = 5021

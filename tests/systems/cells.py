@@ -10,13 +10,13 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from tests.worlds.scaled_arms import perfect
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
-from weldcal.tools.worlds.scaled_arms import perfect
 
 KNOWN_CAMERA = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
 WELD_ONLY = f"job: {{calibrate: false, {KNOWN_CAMERA}}}"  # no pose planning: such a cell is built in a moment

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.worlds.weld.budgets import NOMINAL, planned_seam
+from tests.worlds.weld.plant import groove_config, simulate
+from tests.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose, tick_jacobian
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arms.urdf import Capsule
@@ -20,9 +23,6 @@ from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, Welder, arm_waypoi
 from weldcal.systems.motion.guarded_path import LEAST_SHARE, InfeasiblePath
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT
 from weldcal.systems.motion.spine import SPEED_SHARE as SLEW_SHARE
-from weldcal.tools.worlds.weld.budgets import NOMINAL, planned_seam
-from weldcal.tools.worlds.weld.plant import groove_config, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, SlewLimits, guarded_joint_velocity, slew_limit

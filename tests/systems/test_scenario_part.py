@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.worlds.parts.cells import PartTrial, write_cell
+from tests.worlds.parts.step_parts import PARTS, assembly, box, less, prism, write_step
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import extrude
 from weldcal.models.workpieces.part import Part, numbered, seam_count
@@ -18,8 +20,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, SeamConfig, WorkpieceConfig
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, prism, write_step
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from tests.models.workpieces.random_joints import KINDS
+from tests.worlds.parts.step_parts import PARTS, assembly, write_step
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tools.loading import tool_file
 from weldcal.models.workpieces.reading import read_shape
@@ -31,7 +32,6 @@ from weldcal.tools.commands.cell.new import BASE, OwnPart, write_cell
 from weldcal.tools.commands.cell.screen import PIPE_TOOL
 from weldcal.tools.commands.weld import run_demo, run_weld
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, write_step
 
 END_M = 0.010  # issue 43, item 7
 SHIPPED_MM, OTHERS_MM = 0.15, 0.3  # the same: the largest error that is wanted

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.worlds import doctor
+from tests.worlds.doctor import write_cell
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.fleet import find_cells, judge_cell
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, sparkline
-from weldcal.tools.worlds import doctor
-from weldcal.tools.worlds.doctor import write_cell
 
 
 def calibrated(mm: float = 0.2, **given: Any) -> dict[str, Any]:

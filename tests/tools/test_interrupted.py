@@ -15,9 +15,9 @@ import pytest
 import typer
 
 from tests.interrupted import KNOWN, QUICK, commands, end_after
+from tests.worlds.doctor import write_cell
 from weldcal.models.files import UNFINISHED, whole_result, write_atomic
 from weldcal.tools import console
-from weldcal.tools.worlds.doctor import write_cell
 
 RNG = random.Random(7)
 MOMENTS = [

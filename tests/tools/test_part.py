@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, prism, write_step
 from weldcal.models.errors import InputError
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import numbered, seam_count
@@ -27,7 +28,6 @@ from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, planned, write_cell
 from weldcal.tools.commands.cell.part import with_plans
 from weldcal.tools.commands.cell.screen import Seam, followed, ranked, unfit, ways
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, prism, write_step
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.worlds.parts.cells import PartTrial, write_cell
+from tests.worlds.parts.step_parts import PARTS
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 def proposed(*words: str) -> tuple[int, str]:

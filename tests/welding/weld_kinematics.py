@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL, Budget
-from weldcal.tools.worlds.weld.plant import simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
+from tests.worlds.weld.budgets import NOMINAL, Budget
+from tests.worlds.weld.plant import simulate
+from tests.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig

@@ -1,7 +1,6 @@
 """The command line: every command that is found, in its group, in the order of the help text."""
 
-from collections.abc import Iterable, Iterator, MutableMapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
@@ -12,24 +11,19 @@ from typer.core import TyperGroup
 
 from weldcal.systems.interrupts import answer_signals
 from weldcal.tools import console
-from weldcal.tools.cli.discovery import Entry, find_commands
+from weldcal.tools.cli.discovery import PACKAGES, Entry, find_commands
 
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 GROUPS = {
-    "benchmark": "Measure speed and accuracy.",
-    "reproduce": "Repeat the published studies.",
     "finger": "Calibrate the finger camera and the soft tip.",
     "tool": "Check a tool of your own.",
     "tablet": "Calibrate a wrist camera with a tablet as target.",
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",
-    "dev": "Measure weldcal itself: benchmarks, published studies, mutations.",
 }
 """The groups of commands with their help text; a group that is not here needs no text."""
 DEFAULTS = {"hand-eye": "ax-yb"}
 """The command of a group that is meant where a file follows the group's name."""
-DEVELOPERS = ("benchmark", "reproduce", "mutate")
-"""What is listed under `weldcal dev` only; the names without `dev` work too."""
 
 PANELS = {
     "Calibrate": (
@@ -40,7 +34,6 @@ PANELS = {
     "Robot": ("robots", "check-robot", "check-cell", "emulate-ur", "emulate-cell"),
     "Data": ("import", "export", "schema", "print-board"),
     "Look": ("view", "replay"),
-    "Develop": ("dev",),
 }
 """The commands and groups in the order of the help text."""
 ORDER = (
@@ -49,17 +42,6 @@ ORDER = (
     *("profiler edge", "profiler sphere", "profiler compensate", "profiler seam", "profiler clock", "profiler live"),
 )
 """The full names of the commands in the order of the help text; the others follow by name."""
-
-
-MOVED = {
-    "fuzz-files": "python -m tests.fuzz.run",
-    "flange-halves": "pytest tests/tools/studies/test_flange_halves.py",
-    "flange-holes": "pytest tests/calibration/flange/test_filled_holes.py",
-    "flange-parts": "pytest tests/calibration/flange",
-    "flange-start": "pytest tests/calibration/eye_on_base/test_arm_start.py",
-    "hand-eye-conventions": "pytest tests/calibration/hand_eye/test_written_sets.py",
-}
-"""Studies that are tests now, each with the command that runs it."""
 
 
 class LazyCommands(MutableMapping[str, Any]):
@@ -123,8 +105,6 @@ class CommandGroup(TyperGroup):
 
             entries = self.commands.entries  # type: ignore[attr-defined]
             shown = [name for name in self.commands if name not in entries or not entries[name].hidden]
-            if args[0] in MOVED:
-                ctx.fail(f"'{args[0]}' is no command of version 1.0: in a checkout run {MOVED[args[0]]}.")
             near = nearest(args[0], shown)
             ctx.fail(f"No such command '{args[0]}'." + (f" Did you mean '{near}'?" if near else ""))
         return super().resolve_command(ctx, args)
@@ -180,11 +160,15 @@ def weldcal(
     """The program itself, without a command: only --version."""
 
 
-def build_app() -> typer.Typer:
-    """Return the Typer application with all groups and commands."""
+def build_app(
+    packages: Sequence[str] = PACKAGES, purpose: str = PURPOSE, groups: Mapping[str, str] = GROUPS
+) -> typer.Typer:
+    """Return the Typer application with all groups and commands of packages."""
     place = {title: number for number, title in enumerate(ORDER)}
-    entries = sorted(find_commands().values(), key=lambda entry: (place.get(entry.title, len(ORDER)), entry.title))
-    parts: dict[str, list[Entry]] = {"": [], **{name: [] for name in GROUPS}}
+    entries = sorted(
+        find_commands(packages).values(), key=lambda entry: (place.get(entry.title, len(ORDER)), entry.title)
+    )
+    parts: dict[str, list[Entry]] = {"": [], **{name: [] for name in groups}}
     for entry in entries:
         parts.setdefault(entry.title.rpartition(" ")[0], []).append(entry)
 
@@ -199,16 +183,10 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    root.callback(help=PURPOSE)(weldcal)
-    developers = tuple(replace(entry, hidden=False) for entry in parts[""] if entry.title in DEVELOPERS)
-    dev_group = type("CommandGroup", (CommandGroup,), {"entries": developers})
-    dev = typer.Typer(cls=dev_group, help=GROUPS["dev"], no_args_is_help=True)
+    root.callback(help=purpose)(weldcal)
     for name in filter(None, parts):
-        group = typer.Typer(cls=group_class(name), help=GROUPS.get(name, ""), no_args_is_help=True)
-        if name in DEVELOPERS:
-            dev.add_typer(group, name=name)
-        root.add_typer(group, name=name, hidden=name in DEVELOPERS)
-    root.add_typer(dev, name="dev")
+        group = typer.Typer(cls=group_class(name), help=groups.get(name, ""), no_args_is_help=True)
+        root.add_typer(group, name=name)
     return root
 
 

@@ -1,4 +1,4 @@
-"""Finds the commands: every function under `@command(...)` in the modules of tools/commands and tools/studies.
+"""Finds the commands: every function under `@command(...)` in the modules of tools/commands.
 
 A module is imported when its command is called. Until then only the text of its decorator is read, so that `weldcal
 --help` is fast.
@@ -7,7 +7,7 @@ A module is imported when its command is called. Until then only the text of its
 import ast
 import importlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,8 +15,8 @@ from typing import Any
 
 from weldcal.tools.cli.options import CliCommand
 
-PACKAGES = ("weldcal.tools.commands", "weldcal.tools.studies", "weldcal.tools.cli")
-"""Packages whose modules, at any depth, may hold commands."""
+PACKAGES = ("weldcal.tools.commands", "weldcal.tools.cli")
+"""Packages whose modules, at any depth, hold the commands of weldcal."""
 
 ON_DEMAND = {
     "compare_algorithm1": "weldcal.tools.commands.algorithm1_comparison",
@@ -44,14 +44,14 @@ class Entry:
         raise LookupError(f"{self.module} does not hold the command '{self.title}' under a name of its own.")
 
 
-def find_commands() -> dict[str, Entry]:
-    """Read all commands by title, without importing their modules.
+def find_commands(packages: Sequence[str] = PACKAGES) -> dict[str, Entry]:
+    """Read all commands of packages by title, without importing their modules.
 
     Raises:
         ValueError: two functions are the same command.
     """
     found: dict[str, Entry] = {}
-    for package in PACKAGES:
+    for package in packages:
         for folder in map(Path, importlib.import_module(package).__path__):
             for path in sorted(folder.rglob("*.py")):
                 module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.worlds.doctor import CAUSES, clean, make_world, observe, true_poses
 from weldcal.calibration.doctor.case import DoctorCase, case_text, read_case
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arms.chain import chain_poses
 from weldcal.models.errors import InputError
 from weldcal.tools.report.doctor import CHECKED, worded
-from weldcal.tools.worlds.doctor import CAUSES, clean, make_world, observe, true_poses
 
 SEED = 31
 

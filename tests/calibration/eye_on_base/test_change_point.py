@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.eye_on_base.test_joint_fit import NOISE_M, RIGHT, WRONG, _cell
 from tests.calibration.eye_on_base.test_solve import make_observations
+from tests.worlds.wrong_models import warped_observations
 from weldcal.calibration.eye_on_base.change_point import find_change
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.tools.worlds.wrong_models import warped_observations
 
 
 def moved(observations: list[Observation], at: int, shift_m: float, turn_deg: float = 0.0) -> list[Observation]:

@@ -10,6 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.stats import chi2
 
+from tests.worlds.wrong_models import calibrate_warped, new_errors
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base import joint_fit
 from weldcal.calibration.eye_on_base.estimate import with_scanner
@@ -22,7 +23,6 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.wrong_models import calibrate_warped, new_errors
 
 WORK_C = np.array([0.02, -0.05, 0.38])
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])

@@ -10,12 +10,12 @@ from itertools import combinations
 import numpy as np
 from pydrake.math import RigidTransform
 
+from tests.worlds.flange_frames import flange_frame
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.worlds.flange_frames import flange_frame
 
 FLANGE = "iso9409-1-50-4-m6"
 SCANNER = get_scanner("phoxi_m", 1032)

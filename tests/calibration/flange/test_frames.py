@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from tests.calibration.flange.face import face_points
+from tests.worlds.flange_frames import facing, flange_frame, hidden_frame
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import STANDARDS, get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.worlds.flange_frames import facing, flange_frame, hidden_frame
 
 Array = NDArray[np.float64]
 ISO_50 = "iso9409-1-50-4-m6"

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
+from tests.worlds.flange_frames import facing, flange_frame
 from weldcal.calibration.flange.edge_labels import WRONG, border_likelihood
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import find_holes
@@ -19,7 +20,6 @@ from weldcal.calibration.geometry.primitives import circle_steps, plane_steps
 from weldcal.calibration.geometry.robust import middle, solved
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.worlds.flange_frames import facing, flange_frame
 
 
 @settings(deadline=None)  # the first call compiles

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.calibration.hand_eye.poses import Array, eye_in_hand, random_poses
+from tests.worlds.hand_eye import MISTAKES, fuzz, judge, random_world
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, wrong_scale
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
-from weldcal.tools.worlds.hand_eye import MISTAKES, fuzz, judge, random_world
 
 QUICK = HandEyeConfig(folds=0)
 

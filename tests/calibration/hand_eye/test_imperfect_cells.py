@@ -7,12 +7,12 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
+from tests.worlds.hand_eye import imperfect_cell, ratios
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.choice import solve
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import full_problem, residuals
 from weldcal.calibration.hand_eye.solve import IDENTITY, HandEyeConfig, solve_problem
-from weldcal.tools.worlds.hand_eye import imperfect_cell, ratios
 
 KNOWN = (IDENTITY, IDENTITY, IDENTITY)
 

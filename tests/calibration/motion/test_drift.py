@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, FieldConfig, FilterConfig, PoseField
 from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, FrameNoise, Rows, measured_noise
 from weldcal.calibration.motion.drift.sequential import CREEP, MOVED, WARM_UP, DriftConfig, DriftTest
-from weldcal.tools.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 
 KNOCK_S = 22.3
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.worlds.moves import cube_moves, observed_frames
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
@@ -16,7 +17,6 @@ from weldcal.calibration.motion.expected import Moves, recorded_stream
 from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
-from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 SECONDS = 13.0
 WORK = np.array([0.0, 0.0, 0.75])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.worlds.moves import cube_moves, observed_frames
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.expected import Moves, expected_of_motion, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 NOISE = {"centre_sigma_m": 4.2e-5, "normal_sigma": 5e-4}
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.worlds.moves import cube_moves
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.expected import Moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
-from weldcal.tools.worlds.moves import cube_moves
 
 T = np.random.default_rng(1).uniform(0.5, 5.5, 800)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.worlds.moves import cube_moves, observed_frames
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ARRIVAL, ScannerClock
@@ -17,7 +18,6 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 DELAY_S = 0.140
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.worlds.light_runs import MountedWorld, mounted_plan, mounted_world
 from weldcal.calibration.data.scanner_correction import correction_of
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, pose
 from weldcal.calibration.planning import mounting_estimate as estimate
@@ -20,7 +21,6 @@ from weldcal.calibration.planning.mounting_estimate import (
 from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.calibration.planning.mounting_scene import LENGTH_M
 from weldcal.models.arrays import Array
-from weldcal.tools.worlds.light_runs import MountedWorld, mounted_plan, mounted_world
 
 SEEDS = range(1000, 1040)
 

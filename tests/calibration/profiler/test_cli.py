@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from tests.worlds.profiler import CLEAN, SphereWorld, sphere_trial
 from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import sample_edge_poses
@@ -20,7 +21,6 @@ from weldcal.calibration.profiler.record import load_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.profiler import CLEAN, SphereWorld, sphere_trial
 
 STATE = EdgeState(
     Rotation.from_euler("xyz", [170.0, -9.0, 52.0], degrees=True).as_matrix(),

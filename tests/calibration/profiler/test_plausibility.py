@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from tests.calibration.profiler.test_cli import called, edge_csv, found
 from tests.calibration.profiler.test_sphere import DATA, MM, SIGMAS, clean, needs_data, poses
+from tests.worlds.profiler import CLEAN, RADIUS_M, SphereWorld, sphere_trial
 from weldcal.calibration.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import _clearly_less, check_radius, choose_model, free_radius
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.profiler import CLEAN, RADIUS_M, SphereWorld, sphere_trial
 
 
 def some() -> SphereData:

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
+from tests.worlds.profiler import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 from weldcal.calibration.errors import ArcNotFound, DegenerateMotion, InconsistentData, RadiusError, TooFewTranslations
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, DhArm, ProfilerArmErrors
@@ -27,7 +28,6 @@ from weldcal.calibration.profiler.sphere.linear import (
 )
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.profiler import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 
 DATA = SHARED_DATA / "profiler"
 MM = 1e-3

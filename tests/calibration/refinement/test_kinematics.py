@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.worlds.wrong_models import WrongArmStation, judged, station, study_station
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -24,7 +25,6 @@ from weldcal.calibration.refinement.kinematics_fit import (
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.wrong_models import WrongArmStation, judged, station, study_station
 
 ARM = load_chain("ur10e")
 

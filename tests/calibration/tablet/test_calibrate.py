@@ -16,6 +16,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.calibration.tablet.visit import MM_PER_PX, P_FP, X_FC, csv_options, rows_of, run, write, write_visit
+from tests.worlds.tablet import published_touches
 from weldcal.calibration.errors import TabletDataError
 from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
@@ -23,7 +24,6 @@ from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.tablet import published_touches
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.places import SHARED_DATA, require_data
+from tests.worlds.tablet import TabletNoise, TabletTrial, published_touches, simulate_trial
 from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
 from weldcal.calibration.tablet.planar_fit import (
     PlanarConfig,
@@ -23,7 +24,6 @@ from weldcal.calibration.tablet.planar_fit import (
 )
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.tools.worlds.tablet import TabletNoise, TabletTrial, published_touches, simulate_trial
 
 SYNTH = SHARED_DATA / "profiler/tablet_synth.npz"
 EXACT = TabletNoise(

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.worlds.tablet import TabletTrial, simulate_trial
 from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.published import Sign
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
-from weldcal.tools.worlds.tablet import TabletTrial, simulate_trial
 
 Fields = dict[str, Any]
 PER_LANDMARK = ("uv", "depth", "hand", "theta_deg", "delta_px", "tablet_px")

@@ -12,6 +12,7 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.worlds.touch import TouchWorld, touch_world
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
@@ -29,7 +30,6 @@ from weldcal.calibration.touch.touches import (
 )
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.touch import TouchWorld, touch_world
 
 
 @lru_cache(maxsize=8)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.worlds.parts.step_parts import PARTS, MadePart
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartShape
-from weldcal.tools.worlds.parts.step_parts import PARTS, MadePart
 
 
 class Shelf:

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from OCP.TopAbs import TopAbs_ShapeEnum
 
+from tests.worlds.parts.step_parts import assembly, box, cylinder, fused, less, prism
 from weldcal.models.workpieces.brep import parts_of
 from weldcal.models.workpieces.joints import closes, joints_of
 from weldcal.models.workpieces.reading import read_shape
-from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, fused, less, prism
 
 Floats = npt.NDArray[np.float64]
 TOLERANCE_MM = 0.05  # of a seam's ends, its length and of a ring's points

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.worlds.parts.step_parts import PARTS
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.step import CHORD_MM
-from weldcal.tools.worlds.parts.step_parts import PARTS
 
 if TYPE_CHECKING:
     from tests.models.workpieces.conftest import Shelf

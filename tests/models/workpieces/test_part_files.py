@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 
+from tests.worlds.parts.step_parts import PARTS, assembly, box, write_step
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.workpieces import joints, reading
@@ -22,7 +23,6 @@ from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
 from weldcal.models.workpieces.step import referenced
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, write_step
 
 if TYPE_CHECKING:
     from tests.models.workpieces.conftest import Shelf
@@ -169,7 +169,7 @@ def test_files_that_are_no_part_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_sheet_without_a_volume_is_no_solid(tmp_path: Path) -> None:
-    from weldcal.tools.worlds.parts.step_parts import _face
+    from tests.worlds.parts.step_parts import _face
 
     path = tmp_path / "face.step"
     write_step(_face([(0, 0, 0), (100, 0, 0), (100, 100, 0)]), path)

@@ -9,12 +9,12 @@ import pytest
 from OCP.BRepBuilderAPI import BRepBuilderAPI_NurbsConvert
 
 from tests.models.workpieces.random_joints import KINDS, found_in_mesh, mistakes, write_stl
+from tests.worlds.parts.step_parts import assembly, box, cylinder, fused, less, write_step
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.joints import joints_of
 from weldcal.models.workpieces.mesh_files import read_surface
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
-from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, fused, less, write_step
 
 
 @pytest.mark.parametrize("kind", KINDS)

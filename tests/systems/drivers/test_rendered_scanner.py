@@ -24,6 +24,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F
 
 from tests.systems.cells import Q_HOME, the_arm
+from tests.worlds.scaled_arms import perfect
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene
@@ -39,7 +40,6 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.scaled_arms import perfect
 
 DISTANCE_M = 0.7
 HALF_M = np.array([0.10, 0.07])  # half the sides of the plate that is looked at

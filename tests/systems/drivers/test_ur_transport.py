@@ -9,6 +9,7 @@ import time
 import pytest
 
 from tests.ur_rtde import NEEDS_UR_RTDE
+from tests.worlds.robot.bench import OUTPUT, Bench
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur import rtde
 from weldcal.systems.drivers.ur.link import StartFailed
@@ -17,7 +18,6 @@ from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
 from weldcal.systems.drivers.ur.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
-from weldcal.tools.worlds.robot.bench import OUTPUT, Bench
 
 POLYSCOPE = (5, 21, 1, 0)
 WIRE = AnalogSetPoint(at_full=10.0, value=5.0)

@@ -16,6 +16,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
 from tests.systems.placements import Placement, draw, follow, offered, placed
+from tests.worlds.weld.budgets import PERFECT
+from tests.worlds.weld.plant import groove_config, simulate
+from tests.worlds.weld.seams import get_seam
 from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
@@ -28,9 +31,6 @@ from weldcal.systems.jobs.weld.seam_planning import SeamPlanning, plan_drawn_sea
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.tools.worlds.weld.budgets import PERFECT
-from weldcal.tools.worlds.weld.plant import groove_config, simulate
-from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.locate.planning import RootPlan, seam_above
 from weldcal.welding.seam.clearance import NoClearance
 from weldcal.welding.seam.curve import SeamCurve

@@ -11,6 +11,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, scenario
+from tests.worlds.wrong_models import WrongArmStation, station
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -28,7 +29,6 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.parts import corrected_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.wrong_models import WrongArmStation, station
 
 
 def status_of(world: WrongArmStation) -> CalibrationStatus:

@@ -18,6 +18,8 @@ from tests.systems.jobs.test_tip_to_torch import ARM, PRIOR, Q_HOME, STRAIGHT, T
 from tests.welding.locate.lying import FLOOR, TABLE, looking, put, scan
 from tests.welding.locate.lying import pose as lying_pose
 from tests.welding.locate.test_fit_up import drawn, parts
+from tests.worlds.parts.step_parts import assembly, box, write_step
+from tests.worlds.wrong_models import station
 from weldcal.calibration.calibrate import Steps, calibrate
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
@@ -42,8 +44,6 @@ from weldcal.systems.jobs.weld.seam_planning import (
 from weldcal.systems.jobs.weld.tip_to_torch import torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan
 from weldcal.tools.report.weld import fit_up_csv, fit_up_document
-from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
-from weldcal.tools.worlds.wrong_models import station
 from weldcal.welding.locate.planning import RootPlan, tip_seam
 from weldcal.welding.record.process import path_error
 from weldcal.welding.servo.settings import ServoConfig

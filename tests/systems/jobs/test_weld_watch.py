@@ -10,6 +10,7 @@ import pytest
 from pydrake.systems.framework import Context
 
 from tests.systems.cells import EXACT_PLATE
+from tests.worlds.scaled_arms import perfect
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
@@ -20,7 +21,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import measure
 from weldcal.tools.report.demo import DemoResult, demo_report
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.scaled_arms import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]
 POSE = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 
+from tests.worlds.hand_eye import imperfect_cell, ratios
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.models.errors import InputError
 from weldcal.tools.farm.run import NAME, Farm
-from weldcal.tools.worlds.hand_eye import imperfect_cell, ratios
 
 TASKS: dict[str, Mapping[str, object]] = {f"cell {seed}": {"kind": "both", "seed": seed} for seed in range(2)}
 STUDY = """
 import sys
 from pathlib import Path
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.worlds.hand_eye import ratios
+from tests.worlds.hand_eye import ratios
 if __name__ == "__main__":
     tasks = {f"cell {seed}": {"kind": "both", "seed": seed} for seed in range(400)}
     Farm(Path(sys.argv[1]), workers=1).run(ratios, tasks)

@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
+from tests.worlds.light_runs import mounted_world
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
 from weldcal.calibration.data.scanner_correction import ScannerClock
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -41,7 +42,6 @@ from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
 from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
-from weldcal.tools.worlds.light_runs import mounted_world
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")

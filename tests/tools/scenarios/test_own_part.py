@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.tools.loading import WELDING
@@ -22,7 +23,6 @@ from weldcal.systems.scenario.schema import Scenario, ToolFile
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import OwnPart, edge_numbers, write_cell
-from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])  # an L, mm
 

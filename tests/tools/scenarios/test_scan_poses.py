@@ -9,6 +9,7 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
@@ -25,7 +26,6 @@ from weldcal.tools.commands.cell.new import OwnPart, write_cell
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 SHORT = "workpiece: {{seams: [{{edges: {edges}, start_mm: {start}}}]}}\nwelding: {{seam_length_mm: 40.0}}"
 

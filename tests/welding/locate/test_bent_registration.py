@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.worlds.parts.scans import Scene, scan_part, sideways
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.part import bend, rolled
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
-from weldcal.tools.worlds.parts.scans import Scene, scan_part, sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.worlds.parts.scans import Scene, box, looking_at, scan_part, table
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import cast, get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.worlds.parts.scans import Scene, box, looking_at, scan_part, table
 from weldcal.welding.locate.find_workpiece import AmbiguousWorkpiece, FoundWorkpiece, find_workpiece
 from weldcal.welding.locate.registration import WorkpieceNotFound
 

@@ -1,6 +1,6 @@
 """A V-groove is measured from the cloud alone, with a sigma that holds; what is no groove is refused by name.
 
-Accuracy on poses that no figure was set on is what `weldcal benchmark seam-planning` is for.
+Accuracy on poses that no figure was set on is what `./tools/run figures benchmark seam-planning` is for.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial import cKDTree
 
+from tests.worlds.parts.scans import Scene, box, looking_at, scan_part, sideways, table
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import cast, get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.worlds.parts.scans import Scene, box, looking_at, scan_part, sideways, table
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.groove.seam import GrooveNotFound, GrooveSeam, GrooveTooNarrow, SeveralGrooves
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.parts.scans import subject
+from tests.worlds.parts.scans import subject
 from weldcal.welding.locate.part.joint import measure_joint
 from weldcal.welding.locate.part.model import PartModel
 

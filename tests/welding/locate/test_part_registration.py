@@ -9,10 +9,10 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial.transform import Rotation
 
+from tests.worlds.parts.scans import PartScene, block, box, looking_at, scan_scene, table
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import cast, get_scanner
-from weldcal.tools.worlds.parts.scans import PartScene, block, box, looking_at, scan_scene, table
 from weldcal.welding.locate.part.fit import fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.worlds.parts.scans import box, scan_scene
 from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.drawing import draw_seam
 from weldcal.models.workpieces.part import Part
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.shape import PartShape
-from weldcal.tools.worlds.parts.scans import box, scan_scene
 from weldcal.welding.locate import planning
 from weldcal.welding.locate.planning import locate_part
 

@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, s_curve
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.groove import DROP_M, SEAT_M
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, s_curve
 from weldcal.welding.passes.felt import PassError, WeldPass, backwards, felt_line, lift_m, pass_config, pass_line
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve

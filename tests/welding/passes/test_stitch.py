@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, s_curve
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, s_curve
 from weldcal.welding.passes.stitch import StitchConfig, StitchError
 from weldcal.welding.record.process import PathError, path_error
 from weldcal.welding.servo.settings import ServoConfig, TorchControl

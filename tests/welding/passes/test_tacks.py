@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.groove import SEAT_M
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, s_curve
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.groove import SEAT_M
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, s_curve
 from weldcal.welding.passes.tacks import Tack, TackError, hops
 from weldcal.welding.record.process import PathError, path_error
 from weldcal.welding.seam.curve import SeamCurve

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.seams import arcs
+from tests.worlds.weld.seams import arcs
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.refinement import (
     CornerConfig,

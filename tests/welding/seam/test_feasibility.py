@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.welding.weld_kinematics import l_curve, straight
-from weldcal.tools.worlds.weld.seams import arcs, s_curve
+from tests.worlds.weld.seams import arcs, s_curve
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve

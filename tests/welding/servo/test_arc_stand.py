@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.budgets import PERFECT
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam
+from tests.worlds.weld.budgets import PERFECT
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam
 from weldcal.welding.servo.settings import ServoConfig, TorchControl
 from weldcal.welding.servo.state import Phase
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.broken_seam import broken_off
-from weldcal.tools.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.budgets import NOMINAL
 from weldcal.welding.servo.felt_before import MOVED_M
 
 

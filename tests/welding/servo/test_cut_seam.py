@@ -9,9 +9,9 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.welding.weld_kinematics import Run, weld
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.groove import SEAT_M as SEAT
-from weldcal.tools.worlds.weld.seams import s_curve
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.groove import SEAT_M as SEAT
+from tests.worlds.weld.seams import s_curve
 from weldcal.welding.numerics import changed
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve

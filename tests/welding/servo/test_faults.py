@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.case import WeldCase, judge, study_config
+from tests.worlds.weld.plant import simulate
+from tests.worlds.weld.seams import TrueSeam, arcs
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.case import WeldCase, judge, study_config
-from weldcal.tools.worlds.weld.plant import simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
 from weldcal.welding.servo.settings import ServoConfig, TorchControl, TouchOnConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState

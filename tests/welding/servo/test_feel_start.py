@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit

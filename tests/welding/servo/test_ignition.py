@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.plant import simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.plant import simulate
+from tests.worlds.weld.seams import TrueSeam
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingCommand, WeldingState

@@ -10,9 +10,9 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.welding.weld_kinematics import Run, l_curve, straight, weld
-from weldcal.tools.worlds.weld import plant
-from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.groove import SEAT_M
+from tests.worlds.weld import plant
+from tests.worlds.weld.budgets import NOMINAL
+from tests.worlds.weld.groove import SEAT_M
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.interruption import RAMP_S, Interruption, interruptible_step

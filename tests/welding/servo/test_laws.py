@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
-from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, judge, study_config
-from weldcal.tools.worlds.weld.plant import simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
+from tests.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
+from tests.worlds.weld.case import RunMetrics, WeldCase, judge, study_config
+from tests.worlds.weld.plant import simulate
+from tests.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.servo.laws import LAWS, UnknownLaw, get_law, literal_tangent

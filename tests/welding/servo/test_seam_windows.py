@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.tools.worlds.weld.budgets import HARD, planned_seam
-from weldcal.tools.worlds.weld.seams import arcs, get_seam, on_cylinder
+from tests.worlds.weld.budgets import HARD, planned_seam
+from tests.worlds.weld.seams import arcs, get_seam, on_cylinder
 from weldcal.welding.numerics import changed
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve

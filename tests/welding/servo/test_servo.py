@@ -12,10 +12,10 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.welding.weld_kinematics import Run, l_curve, straight, weld
-from weldcal.tools.worlds.weld.budgets import HARD, NOMINAL, PERFECT
-from weldcal.tools.worlds.weld.groove import DROP_M as DROP
-from weldcal.tools.worlds.weld.groove import SEAT_M as SEAT
-from weldcal.tools.worlds.weld.seams import s_curve
+from tests.worlds.weld.budgets import HARD, NOMINAL, PERFECT
+from tests.worlds.weld.groove import DROP_M as DROP
+from tests.worlds.weld.groove import SEAT_M as SEAT
+from tests.worlds.weld.seams import s_curve
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import (

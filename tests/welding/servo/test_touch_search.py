@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.worlds.weld import plant
+from tests.worlds.weld.budgets import NOMINAL, Unknowns
+from tests.worlds.weld.case import RunMetrics, judge
+from tests.worlds.weld.groove import TipPlace, Wedge
+from tests.worlds.weld.seams import TrueSeam, arcs
 from weldcal.systems.jobs.weld.arm_way import leaning
-from weldcal.tools.worlds.weld import plant
-from weldcal.tools.worlds.weld.budgets import NOMINAL, Unknowns
-from weldcal.tools.worlds.weld.case import RunMetrics, judge
-from weldcal.tools.worlds.weld.groove import TipPlace, Wedge
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.numerics import Array, changed
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from weldcal.tools.worlds.weld.budgets import IMPERFECT, NOMINAL
-from weldcal.tools.worlds.weld.plant import StudyRun, simulate
-from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
+from tests.worlds.weld.budgets import IMPERFECT, NOMINAL
+from tests.worlds.weld.plant import StudyRun, simulate
+from tests.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.record.process import PathError, path_error
 from weldcal.welding.record.weave import measure_weave
 from weldcal.welding.servo.settings import MotionLimits, ServoConfig, ToolGeometry

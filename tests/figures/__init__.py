@@ -1,0 +1,1 @@
+"""What README and docs cite, and the papers' tables: each study prints its rows."""

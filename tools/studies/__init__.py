@@ -1,1 +1,0 @@
-"""Studies that reproduce published or targeted figures from one command."""
