@@ -20,11 +20,11 @@ from tests.documents.scans import WRIST_POSES, write_wrist_scans
 from tests.documents.scans import X_FC as X_WRIST
 from tests.worlds.flange_frames import flange_frame
 from tests.worlds.moves import TargetInHand, observed_frames
+from tests.worlds.streams import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
-from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array

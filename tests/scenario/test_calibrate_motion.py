@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from tests.worlds.flange_frames import empty_frame, flange_frame
 from tests.worlds.moves import cube_moves, observed_frames
+from tests.worlds.streams import recorded_stream
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.errors import DatasetError, TooFewPoses
-from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -7,9 +7,9 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from tests.worlds.streams import ROBOT, Moves, closed_moves
 from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, inverse, rotation_vector
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
-from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arms.chain import chain_inverse, chain_of, chain_poses, load_chain
 from weldcal.models.arms.inverse import nearest_solution

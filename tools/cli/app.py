@@ -27,7 +27,7 @@ DEFAULTS = {"hand-eye": "ax-yb"}
 
 PANELS = {
     "Calibrate": (
-        *("calibrate", "verify", "apply", "hand-eye", "profiler", "tablet", "plan-poses", "plan-motion"),
+        *("calibrate", "verify", "apply", "hand-eye", "profiler", "tablet", "plan-poses"),
         *("doctor", "monitor", "fleet"),
     ),
     "Weld": ("demo", "weld", "plan-passes", "part", "new", "finger", "tool"),

@@ -169,7 +169,7 @@ def motion_screen(
         notes=notes,
     )
     if tolerance is not None and not tolerance.met:
-        after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
+        after = Next("Record a longer motion, with more turns, or scans at rest.")
     elif r.symbol == "X_BC":
         watched = f"run '{typed('monitor --calibration', out)}' and name another recording of the flange"
         after = Next(f"Verify with scans at rest that the calibration has not seen; or {watched}.", uses=True)

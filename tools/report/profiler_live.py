@@ -36,20 +36,6 @@ from weldcal.welding.seam.curve import SeamCurve
 
 WITHIN_MM = 0.3
 _NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
-_COLUMNS = {
-    "seed": "seed",
-    "state": "",
-    "edge_error_mm": "edge, mm",
-    "edge_sigma_mm": "sigma",
-    "edge_nees": "NEES",
-    "sphere_error_mm": "sphere, mm",
-    "sphere_sigma_mm": "sigma",
-    "sphere_nees": "NEES",
-    "largest_sigmas": "largest",
-    "sphere_tip_error_mm": "tip, mm",
-    "torch_mean_mm": "torch, mm",
-    "torch_max_mm": "at most",
-}
 RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
 PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 _COLOURS = {"edge": OURS, "sphere": RUST}
@@ -324,44 +310,15 @@ def live_report(
     }
     return render(
         "profiler_live.html.j2",
-        many=False,
         first=first,
         s=summary,
         rows=[_row(n, p) for n, p in _poses(outcome).items()],
         sigmas=sigmas_picture(poses) if poses else None,
         seam=path_picture(paths, WITHIN_MM) if paths else None,
         profiles=profiles_picture(shown) if shown else None,
-        torch=None,
-        per_seed=[],
-        header=(),
         tip_mm=outcome.tip_mm,
         recording=recording,
         **robot_timing(run),
-    )
-
-
-def seeds_report(
-    found: Mapping[str, object], rows: Sequence[Mapping[str, object]], outcomes: Sequence[LiveOutcome], first_seed: int
-) -> str:
-    """Return the page of many seeds."""
-    poses = {n: [p for o in outcomes if (p := getattr(o, n)) is not None] for n in ("edge", "sphere")}
-    poses = {n: p for n, p in poses.items() if p}
-    followed = [(first_seed + k, o.torch) for k, o in enumerate(outcomes) if o.torch is not None]
-    columns = [c for c in _COLUMNS if any(c in row for row in rows)]
-    return render(
-        "profiler_live.html.j2",
-        many=True,
-        first=None,
-        s=found,
-        rows=[],
-        sigmas=sigmas_picture(poses) if poses else None,
-        seam=None,
-        profiles=None,
-        torch=torch_bars([k for k, _ in followed], [p for _, p in followed], WITHIN_MM) if followed else None,
-        per_seed=[tuple(_shown(row.get(c)) for c in columns) for row in rows],
-        header=tuple(_COLUMNS[c] for c in columns),
-        tip_mm=None,
-        recording=False,
     )
 
 
@@ -388,10 +345,6 @@ def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
         fixed(p.largest, 2),
         fixed(p.nees, 1),
     )
-
-
-def _shown(value: object) -> str:
-    return fixed(value, 2) if isinstance(value, float) else "–" if value is None else str(value)
 
 
 def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:
@@ -447,18 +400,3 @@ def profiles_picture(profiles: Mapping[str, Array]) -> bytes:
             axes.set_ylabel("z, mm")
         axes.spines[["top", "right"]].set_visible(False)
     return svg(figure, figure.axes[0])
-
-
-def torch_bars(seeds: Sequence[int], paths: Sequence[PathOutcome], limit_mm: float) -> bytes:
-    """Mean and largest distance of the torch from the true line, a pair a seed."""
-    figure, axes = subplots(8.2, 3.0)
-    x = np.arange(len(paths))
-    axes.bar(x, [p.distance_mm.max() for p in paths], color="#e3c3ae", width=0.7, label="largest")
-    axes.bar(x, [p.distance_mm.mean() for p in paths], color=RUST, width=0.7, label="mean")
-    axes.axhline(limit_mm, color="#a8402f", linewidth=1, linestyle=":")
-    axes.annotate(f"{limit_mm:g} mm", (-0.35, limit_mm), fontsize=9, va="bottom", color="#a8402f")
-    axes.set_xticks(x, [str(s) for s in seeds])
-    axes.set(xlabel="seed", ylabel="torch off the true line, mm")
-    axes.set_ylim(0.0, 1.3 * max(limit_mm, max(float(p.distance_mm.max()) for p in paths)))
-    axes.legend(frameon=False, ncols=2, loc="upper right")
-    return svg(figure, axes)

@@ -10,10 +10,10 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.worlds.moves import cube_moves, observed_frames
+from tests.worlds.streams import Moves, recorded_stream
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
-from weldcal.calibration.motion.expected import Moves, recorded_stream
 from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array

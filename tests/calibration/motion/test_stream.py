@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.worlds.moves import cube_moves
+from tests.worlds.streams import Moves, recorded_stream
 from weldcal.calibration.data.motion_dataset import RobotStream
-from weldcal.calibration.motion.expected import Moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 

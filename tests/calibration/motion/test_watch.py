@@ -8,12 +8,12 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.worlds.moves import cube_moves, observed_frames
+from tests.worlds.streams import recorded_stream
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ARRIVAL, ScannerClock
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.motion.drift.watch import watch
-from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise

@@ -26,13 +26,13 @@ from tests.figures.motion.drift import benchmark_drift
 from tests.figures.subject import one_of
 from tests.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 from tests.worlds.moves import DELAY_S, cube_moves, observed_frames
+from tests.worlds.streams import recorded_stream
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
-from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import load_arm

@@ -3,7 +3,6 @@
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,14 +16,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioArgument, command, option
 from weldcal.tools.commands.run import JobRun, named_once, run_job, run_options
-from weldcal.tools.report.profiler_live import (
-    WITHIN_MM,
-    LiveOutcome,
-    ProfilerLive,
-    live_outcome,
-    live_report,
-    seeds_report,
-)
+from weldcal.tools.report.profiler_live import ProfilerLive, live_outcome, live_report
 from weldcal.tools.report.render import mappings_csv, write_atomic
 from weldcal.tools.report.run import RunOptions
 
@@ -43,16 +35,12 @@ def profiler_live(
     scenario: Annotated[
         str, option("--scenario", "NAME", "profiler_edge, profiler_sphere, profiler_seam or a YAML file.")
     ] = PROFILER_SCENARIO,
-    runs: Annotated[int, option("--runs", "N", "Number of seeds, from --seed on.", min=1)] = 1,
     record: RecordOption = False,
 ) -> Outcome:
     """Calibrate a profiler on the arm by an edge and a touched sphere, then scan and follow a seam."""
     chosen = named_once(name, scenario, PROFILER_SCENARIO)
     options = run_options(call, "profiler-live", chosen, recording=record)
-    loaded = load_scenario(chosen)
-    if runs > 1:
-        return Outcome(run_profiler_seeds(loaded, options, runs, call.progress))
-    found = run_profiler_live(loaded, options, call.progress)
+    found = run_profiler_live(load_scenario(chosen), options, call.progress)
     return Outcome(found.summary(), first=found.first)
 
 
@@ -128,52 +116,3 @@ def _touched(arm: ArmModel, touches: Sequence[Array], tip: Sequence[float], radi
         more["touch_T"] = np.array([forward_kinematics(arm, q).GetAsMatrix4() for q in touches])
         more |= {"touch_q": np.array(touches), "tip": np.array(tip)}
     return more
-
-
-def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progress: Progress) -> dict[str, object]:
-    """Run several seeds, each in its own folder; seeds.csv is updated after each run, report.html shows all runs."""
-    rows: list[dict[str, object]] = []
-    outcomes: list[LiveOutcome] = []
-    for k in range(runs):
-        seed = options.seed + k
-        one = replace(options, seed=seed, out=options.out / f"seed{seed:02d}", recording=False)
-
-        def part(what: str, share: float, k: int = k) -> None:
-            progress(what, (k + share) / runs)
-
-        live = run_profiler_live(scenario, one, part)
-        live.run.raise_if_interrupted()
-        rows.append(_flat(live.summary()))
-        outcomes.append(live.outcome)
-        columns = list(dict.fromkeys(name for row in rows for name in row))
-        write_atomic(options.out / "seeds.csv", mappings_csv([{c: row.get(c, "") for c in columns} for row in rows]))
-    done = [row for row in rows if row["state"] == "done"]
-    found: dict[str, object] = {"state": "done" if len(done) == runs else "held", "scenario": options.scenario}
-    found |= {"runs": runs, "runs_done": len(done)}
-    if len(done) < runs:
-        found["reason"] = next(str(row.get("reason")) for row in rows if row["state"] != "done")
-    for name in ("edge", "sphere"):
-        poses = [p for o in outcomes if (p := getattr(o, name)) is not None]
-        if poses:
-            found[f"{name}_mean_nees"] = float(np.mean([p.nees for p in poses]))
-            found[f"{name}_largest_sigmas"] = float(np.max([p.largest for p in poses]))
-            found[f"{name}_rms_mm"] = float(np.sqrt(np.mean([p.error_mm**2 for p in poses])))
-            found[f"{name}_within_3_sigma"] = sum(p.within_3_sigma for p in poses)
-    torches = [o.torch.distance_mm for o in outcomes if o.torch is not None]
-    if torches:
-        found["torch_mean_mm"] = float(np.mean([t.mean() for t in torches]))
-        found["torch_max_mm"] = float(np.max([t.max() for t in torches]))
-        found["torch_within"] = sum(bool(t.max() <= WITHIN_MM) for t in torches)
-    write_atomic(options.out / "report.html", seeds_report(found, rows, outcomes, options.seed))
-    return found
-
-
-def _flat(summary: Mapping[str, object]) -> dict[str, object]:
-    """One row: nested values under their full name, without lists."""
-    row: dict[str, object] = {}
-    for name, value in summary.items():
-        if isinstance(value, Mapping):
-            row |= {f"{name}_{k}": v for k, v in value.items() if not isinstance(v, list)}
-        else:
-            row[name] = value
-    return row
