@@ -184,6 +184,14 @@ def test_the_import_name_is_always_weldcal() -> None:
     assert wrong == []
 
 
+def test_the_package_imports_no_test() -> None:
+    of_tests = [
+        path for path, tree in trees().items() if any(f"{name}.".startswith("tests.") for name in imported(tree))
+    ]
+    assert of_tests == []
+    assert list(imported(ast.parse("from tests.worlds import motion"))) == ["tests.worlds.motion"]
+
+
 def test_diagram_systems_live_in_systems_only() -> None:
     holders = [name for name, tree in trees().items() if names(tree) & {"LeafSystem", "VectorSystem"}]
     assert holders, "the cell has systems"
