@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def a_post(folder: Path) -> tuple[Path, PartJoint]:
 def answers(monkeypatch: pytest.MonkeyPatch, poses: list[set[int]]) -> None:
     """Let the arm weld in each pose of the part only some edges, each alone."""
 
-    def places(scenario: Scenario, apart: bool = False, advises: bool = False) -> object:
+    def places(scenario: Scenario, apart: bool = False, advises: bool = False, until_s: float = 0.0) -> object:
         asked = scenario.workpiece.seams  # type: ignore[union-attr]
         alone = {seam.edges[0]: k for k, seam in enumerate(asked) if len(seam.edges) == 1}
         found = [
@@ -320,15 +321,28 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
         seam_of(shape, SeamSource(edges=(outside,)), "fillet")
 
 
-def test_after_a_minute_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_its_time_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shape = read_shape(step)
-    monkeypatch.setattr(new, "offered", lambda *_: ([], {1: "Too near."}))
     seams = ranked(shape, load_tool(WELDING).tool)
-    for most, count in ((60.0, 2), (0.0, 1)):
-        monkeypatch.setattr(new, "MOST_PLANNING_S", most)
-        monkeypatch.setattr(new, "process_time", iter((0.0, 0.0, 1.0)).__next__)
+    for count in (2, 1):
+        answers = iter([([], {1: "Too near."})] * count)
+
+        def offered(*_: object, answers: Iterator[object] = answers, **__: object) -> object:
+            if (answer := next(answers, None)) is None:
+                raise new.OutOfTimeError
+            return answer
+
+        monkeypatch.setattr(new, "offered", offered)
         found = with_plans(shape, seams, 10, step, None, WELDING, lambda stage, share: None)
         assert sorted(seam.planned for seam in found) == [False] * (2 - count) + [True] * count
+
+
+def test_no_place_is_looked_for_after_the_time(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time is that of the command with the process that reads the part."""
+    monkeypatch.setattr(new, "MOST_PART_S", 0.0)
+    seams = ranked(read_shape(step), load_tool(WELDING).tool)
+    found = with_plans(read_shape(step), seams, 10, step, None, WELDING, lambda stage, share: None)
+    assert not any(seam.planned for seam in found)
 
 
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Which joints of a part a tool fits, why not the others, and in which pieces a seam may be welded."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,13 @@ SMALL_M = 0.012  # a part this small may be drawn in inches
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
+UNLIKE, LEAST_PLATE_M = 5.0, 8e-4  # ratio of two thicknesses that are not welded to each other; the least thickness
+MOST_PLATE_M = 0.012  # a plate thicker than this makes a seam no more important: a choice
+PURCHASED = re.compile(
+    r"bolt|screw|washer|rivet|cast[eo]r|\bnuts?\b|\bnut_|\b(din|iso|ansi)[ _]?\d{3}|\bm\d+ ?x ?\d|wood|\bmdf\b"
+    r"|schraube|mutter|scheibe",
+    re.IGNORECASE,
+)  # names of what is not welded
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
@@ -97,6 +105,7 @@ class Seam:
             "angle_deg": math.degrees(j.angle_rad),
             "gap_mm": 1e3 * j.gap_m,
             "least_radius_mm": None if self.radius_m is None else 1e3 * self.radius_m,
+            "plates_mm": [1e3 * thick for thick in j.thick_m],
             "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad) if j.walls_m[0] else None,
             "closed": j.closed,
             "weldable": not self.reason,
@@ -119,9 +128,10 @@ def side_of(edge: PartEdge) -> str:
 
 
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """Sort a part's joints: those that the tool can weld, the felt and the upward ones first, then the nearest misses.
+    """Sort a part's joints as a welder would: those that the tool can weld first, then the nearest misses.
 
-    The arm is not asked. Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
+    Of them purchased parts and plates of unlike thickness come last; the felt and the upward ones first, then by length
+    times the thinner plate. The arm is not asked. Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
     """
     found = []
     for joint in shape.joints or _creases(shape):
@@ -133,8 +143,23 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
 
 
 def _order(seam: Seam) -> tuple[Any, ...]:
-    above = seam.joint.up_P[2] > OPEN_ABOVE
-    return (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above, seam.short_m, -seam.joint.length_m)
+    j, thin, thick = seam.joint, min(seam.joint.thick_m), max(seam.joint.thick_m)
+    unlike = thick > 0.0 and (thin < LEAST_PLATE_M or thick > UNLIKE * thin)  # a board on a tube, a shaft in a sheet
+    unlikely = unlike or any(PURCHASED.search(name) for name in j.bodies)
+    worth = round(j.length_m * min(thin or MOST_PLATE_M, MOST_PLATE_M), 7)  # m2
+    above = j.up_P[2] > OPEN_ABOVE
+    fits = bool(seam.reason), unlikely, not seam.felt, round(seam.short_m, 3)
+    return (*fits, not above, seam.short_m, -worth)
+
+
+def alike(seams: Sequence[Seam]) -> list[list[int]]:
+    """Return the numbers of the seams in groups of one type, length, angle, thickness and verdict, each as ranked."""
+    found = dict[tuple[Any, ...], list[int]]()
+    for k, seam in enumerate(seams):
+        j = seam.joint
+        sizes = round(1e3 * j.length_m), round(math.degrees(j.angle_rad)), round(1e4 * min(j.thick_m)), len(j.edges)
+        found.setdefault((j.type, *sizes, not seam.reason, seam.planned, bool(seam.offers)), []).append(k)
+    return list(found.values())
 
 
 def _creases(shape: PartShape) -> list[PartJoint]:
@@ -200,7 +225,7 @@ def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""
-    far, across = max(joint.walls_m), 2.0 * float(np.linalg.norm(ring[0][0] - ring[0][:-1].mean(axis=0)))
+    far, across = round(max(joint.walls_m), 3), 2.0 * float(np.linalg.norm(ring[0][0] - ring[0][:-1].mean(axis=0)))
     words = f" The least pipe for this tool is {1e3 * least_pipe_m(tool, far):.0f} mm across."
     other = load_tool(tool_file(Path(PIPE_TOOL))).tool
     if tool.chord_m <= other.chord_m or across < least_pipe_m(other, far):
