@@ -321,6 +321,51 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
         seam_of(shape, SeamSource(edges=(outside,)), "fillet")
 
 
+def test_seams_are_ranked_as_a_welder_would(tmp_path: Path) -> None:
+    """A long thick rib, a short one, then a bolt by its name and a board on it that is ten times as thick as its tube."""
+    bodies = {
+        "base": box((0, 0, -10), (600, 400, 10)),
+        "M10 bolt": cylinder((500, 350, 0), 60, 30),
+        "rib": box((50, 60, 0), (150, 10, 40)),
+        "long rib": box((50, 200, 0), (300, 10, 40)),
+        "sheet": box((50, 330, 0), (350, 1.5, 40)),
+    }
+    write_step(assembly(*bodies.values()), tmp_path / "a.step")
+    text = (tmp_path / "a.step").read_text()
+    for k, name in enumerate(bodies):
+        text = re.sub(rf"'Open CASCADE STEP translator [\d.]+ \d+\.{k + 1}'", f"'{name}'", text)
+    (tmp_path / "a.step").write_text(text)
+    seams = ranked(read_shape(tmp_path / "a.step"), load_tool(WELDING).tool)
+    order = list(dict.fromkeys(seam.joint.bodies[1] for seam in seams))
+    assert order[:2] == ["long rib", "rib"]
+    assert [round(1e3 * v) for v in seams[0].joint.thick_m] == [10, 10]
+
+
+def test_of_a_ring_of_edges_those_that_the_tool_fits_are_offered(tmp_path: Path) -> None:
+    """A square post with a wall beside one of its four sides."""
+    post, wall = box((0, 0, 0), (160, 160, 80)), box((-40, -100, 0), (10, 360, 120))
+    write_step(assembly(box((-150, -150, -10), (500, 460, 10)), post, wall), tmp_path / "post.step")
+    shape = read_shape(tmp_path / "post.step")
+    around = {e.id for e in shape.edges if e.points_P.min() > -1e-6 and e.points_P.max() < 0.16 + 1e-6}
+    seam = next(s for s in ranked(shape, load_tool(WELDING).tool) if set(s.joint.edges) <= around)
+    assert (seam.reason, len(seam.refused)) == ("", 1)
+    (id,) = seam.refused
+    assert shape.edge(id).points_P[:, 0] == pytest.approx(0.0)
+    assert "The tool does not fit" in seam.refused[id]
+
+
+def test_equal_seams_are_one_line(tmp_path: Path) -> None:
+    plates = [box((0, 0, -10), (700, 200, 10)), *(box((60 + 180 * k, 20, 0), (10, 150, 40)) for k in range(4))]
+    write_step(assembly(*plates), tmp_path / "ribs.step")
+    words = ["part", str(tmp_path / "ribs.step"), "--plan", "0", "--out", str(tmp_path / "out")]
+    printed = " ".join(CliRunner().invoke(app, words).stdout.split())
+    assert "the tool fits 4 seams" in printed
+    assert re.search(r"seam 1 .* 3 like it: edge", printed)
+    result = CliRunner().invoke(app, [*words, "--json", "--overwrite"])
+    likes = [seam["like"] for seam in json.loads(result.stdout.splitlines()[-1])["seams"]]
+    assert likes == [1, 1, 1, 1]
+
+
 def test_after_its_time_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shape = read_shape(step)
     seams = ranked(shape, load_tool(WELDING).tool)

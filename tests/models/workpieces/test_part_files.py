@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -464,6 +465,9 @@ def test_a_part_is_read_once_until_its_file_is_written_again(tmp_path: Path) -> 
     write_stl(path, t_mesh())
     first = read_shape(path)
     assert read_shape(path) is first
+    (tmp_path / "copy").mkdir()
+    copied = Path(shutil.copy(path, tmp_path / "copy"))
+    assert read_shape(copied) is first
     assert read_shape(path, "inch") is not first
     write_stl(path, t_mesh(2.0))
     assert read_shape(path).mesh.bounds[1, 2] == pytest.approx(0.4)

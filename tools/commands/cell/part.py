@@ -78,7 +78,7 @@ def part(
     first_like = {k: group[0] + 1 for group in groups for k in group}
     rows = [{**seam.as_row(), "like": first_like[k]} for k, seam in enumerate(seams)]
     summary = {**as_json(shape, folder), "seams": rows}
-    first = next((offer.edges for seam in seams for offer in seam.offers), None)
+    first = next((tuple(offer.edges) for seam in seams for offer in seam.offers), None)
     if first is None and plan > 0:  # no time was left to ask the arm
         first = next((seam.joint.edges for seam in seams if not seam.reason and not seam.planned), None)
     following = "" if first is None else make(first)
@@ -249,7 +249,7 @@ def page_rows(
         for offer in seam.offers:
             add(seam, offer.edges, "yes", replace(seam, offers=(offer,)).verdict, offer)
         if not seam.planned and not seam.reason:
-            add(seam, seam.joint.edges, "fits", seam.verdict)
+            add(seam, [id for id in seam.joint.edges if id not in seam.refused], "fits", seam.verdict)
         refused = dict.fromkeys(seam.joint.edges, seam.reason) if not seam.planned and seam.reason else seam.refused
         for ids, why in by_reason(refused):
             add(seam, ids, "no", f"no: {seam.reason if len(seam.joint.edges) == 1 else why}")

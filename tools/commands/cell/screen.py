@@ -136,17 +136,25 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     found = []
     for joint in shape.joints or _creases(shape):
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        reason, short_m, felt = _obstacle(shape, joint, tool) if shape.joints else ("", 0.0, True)
+        refused, felt = _obstacles(shape, joint, tool) if shape.joints else ({}, True)
+        short_m = max((short for _, short in refused.values()), default=0.0)
+        why, reason = {id: words for id, (words, _) in refused.items()}, ""
+        if refused and len(refused) < len(joint.edges):
+            short_m = 0.0  # the rest is welded
+        elif refused:
+            id, reason = next(iter(why.items()))
+            reason = f"edge {id}: {reason}" if len(refused) > 1 and reason.startswith("The tool does not") else reason
         radius = min(radii, default=None)
-        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt))
-    return sorted(found, key=_order)
+        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt, refused=why))
+    return sorted(found, key=lambda seam: _order(shape, seam))
 
 
-def _order(seam: Seam) -> tuple[Any, ...]:
+def _order(shape: PartShape, seam: Seam) -> tuple[Any, ...]:
     j, thin, thick = seam.joint, min(seam.joint.thick_m), max(seam.joint.thick_m)
     unlike = thick > 0.0 and (thin < LEAST_PLATE_M or thick > UNLIKE * thin)  # a board on a tube, a shaft in a sheet
     unlikely = unlike or any(PURCHASED.search(name) for name in j.bodies)
-    worth = round(j.length_m * min(thin or MOST_PLATE_M, MOST_PLATE_M), 7)  # m2
+    length_m = j.length_m - sum(shape.edge(id).length_m for id in seam.refused if not seam.reason)
+    worth = round(length_m * min(thin or MOST_PLATE_M, MOST_PLATE_M), 7)  # m2
     above = j.up_P[2] > OPEN_ABOVE
     fits = bool(seam.reason), unlikely, not seam.felt, round(seam.short_m, 3)
     return (*fits, not above, seam.short_m, -worth)
@@ -170,10 +178,10 @@ def _creases(shape: PartShape) -> list[PartJoint]:
     ]
 
 
-def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
-    """Say why a tool does not fit a joint, by how much (m), and whether the joint is felt.
+def _obstacles(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[dict[int, tuple[str, float]], bool]:
+    """Say why a tool does not fit edges of a joint, by how much (m), by edge; and whether the joint is felt.
 
-    Its ball is tried at the walls, its body at the middle of one of the edges.
+    Its ball is tried at the walls, its body at the middle of each edge.
     """
     flush = joint.angle_rad > math.pi - 0.01
     half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
@@ -185,24 +193,31 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             check_weldable(section, tool.tip_radius_m)
         if ring is not None:
             check_ring(shape.mesh, *ring, section, tool)
-        for id in joint.edges if ring is None else ():
-            edge = shape.edge(id)
-            assert edge.up_P is not None
-            k = max(1, len(edge.points_P) // 2)
-            along = edge.points_P[k] - edge.points_P[k - 1]
-            middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
-            tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
-            line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
+    except WeldcalError as error:
+        why = _why(error)
+        if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
+            why = why[0] + least_pipe(shape, joint, tool), why[1]
+        return dict.fromkeys(joint.edges, why), felt
+    found = dict[int, tuple[str, float]]()
+    for id in joint.edges if ring is None else ():
+        edge = shape.edge(id)
+        assert edge.up_P is not None
+        k = max(1, len(edge.points_P) // 2)
+        along = edge.points_P[k] - edge.points_P[k - 1]
+        middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
+        tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
+        line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
+        try:
             seam = SeamCurve.from_points(line, up=np.tile(edge.up_P, (5, 1)))
             check_clearance(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
-    except WeldcalError as error:
-        reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
-        if isinstance(error, NoClearance) and len(joint.edges) > 1:
-            reason = f"edge {id}: {reason}"
-        if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
-            reason += least_pipe(shape, joint, tool)
-        return reason, error.short_m if isinstance(error, NoClearance) else math.inf, felt
-    return "", 0.0, felt
+        except WeldcalError as error:
+            found[id] = _why(error)
+    return found, felt
+
+
+def _why(error: WeldcalError) -> tuple[str, float]:
+    reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
+    return reason, error.short_m if isinstance(error, NoClearance) else math.inf
 
 
 def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
