@@ -131,7 +131,9 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     """Sort a part's joints as a welder would: those that the tool can weld first, then the nearest misses.
 
     Of them purchased parts and plates of unlike thickness come last. The felt and the upward ones come first, then
-    those with the largest length times thinner plate. The arm is not asked. Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
+    those with the largest length times thinner plate. The arm is not asked.
+
+    Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
     """
     found = []
     for joint in shape.joints or _creases(shape):
