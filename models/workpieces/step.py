@@ -369,11 +369,16 @@ def with_joints(
     from weldcal.models.workpieces.joints import closes
 
     known, joints = list(edges), []
+    ends = np.array([edge.points_P[[0, -1]] for edge in edges]).reshape(-1, 2, 3)
+    closed = np.array([edge.closed for edge in edges], dtype=bool)
     for chain in chains:
         ids = []
         for piece in chain:
             kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
-            lies = (k for k, edge in enumerate(known) if edge.up_P is None and _is(edge, 1e-3 * piece.line))
+            line = 1e-3 * piece.line
+            apart = [np.abs(ends - line[some]).max(axis=(1, 2)) for some in ([0, -1], [-1, 0])]
+            near = np.flatnonzero(closed | (np.minimum(*apart) < 2e-5)).tolist()
+            lies = (k for k in near if known[k].up_P is None and _is(known[k], line))
             at = next(lies, len(known))
             radius = known[at].radius_m if at < len(known) else None
             line = known[at].points_P if at < len(known) else 1e-3 * piece.line
