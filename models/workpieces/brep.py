@@ -6,6 +6,7 @@ Lengths in mm.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -321,6 +322,21 @@ def _beside_chord(line: Floats) -> float:
     along = unit(line[-1] - line[0])
     v = line - line[0]
     return float(np.linalg.norm(v - np.outer(v @ along, along), axis=1).max())
+
+
+def of_opencascade(error: Exception) -> bool:
+    """Return whether an exception is one of OpenCascade's, which have no other class in common."""
+    return type(error).__module__.split(".")[0] == "OCP"
+
+
+def called(names: Sequence[str], k: int) -> str:
+    """Return the name of a body, or its number where the file has none."""
+    return f"'{names[k]}'" if k < len(names) and names[k] else f"body {k + 1}"
+
+
+def listed(words: Sequence[str], most: int = 4) -> str:
+    """Return words as one phrase, the first few of many."""
+    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
 
 
 def parts_of(shape: Any, kind: Any) -> list[Any]:

@@ -16,6 +16,7 @@ from weldcal.models.workpieces.section import PROBES_M, Opening, Section, cut, o
 
 Floats = npt.NDArray[np.float64]
 
+EXACT_M = 1e-7  # between a line and the root that a second pass would leave as it is
 FARTHEST_M = 0.003  # between a drawn line and the root of the joint
 WIDEST_GAP_M = 0.008
 NO_GAP_M = 1e-6  # between triangles of one face, or plates that touch: the seam is then where its line is
@@ -43,6 +44,8 @@ def draw_seam(
     for _ in range(2):  # the second time from the root that the first has found
         tangents = directions(points, closed)
         found = _fitted(mesh, points, tangents, ups, joint, closed)
+        if len(found.root) == len(points) and np.abs(found.root - points).max() < EXACT_M:
+            break  # the line is the root already, as an edge of a part
         points, ups, closed = found.root, found.up, closed and found.whole
     assert found is not None
     if joint == "lap" and min(found.height) > SHEET_M:

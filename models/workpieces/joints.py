@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
@@ -26,8 +26,11 @@ from weldcal.models.workpieces.brep import (
     Solid,
     SolidFace,
     array_of,
+    called,
     length_of,
+    listed,
     middle_of,
+    of_opencascade,
     parts_of,
     sampled,
     unit,
@@ -42,7 +45,8 @@ LEAST_MM = 0.5  # length of a piece
 FLUSH_MM = 0.2  # between two faces in one plane
 FREE_MM = 2.0  # the joint is open at least this far: a clearance is no joint
 GRAZING = 1e-3  # rad, between a line and a plane that crosses it
-MOST_S = 40.0  # of processor time for a part's joints, of the 60 s in which a large file is read
+MOST_S = 25.0  # of processor time for a part's joints, of the 45 s in which a large file is read
+WELDED = "the bodies that are welded, without threads, holes and purchased parts"
 NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 
 
@@ -58,6 +62,7 @@ class Piece:
     bodies  numbers of the two bodies
     side    inside or outside of a corner, left or right of a web; else ""
     walls   mm, extent of the two walls from the root; of flush faces the depth of the joint
+    thick   mm, of the two bodies under their walls, beside the root
     pipe    the type of a ring of such pieces: pipe on plate, pipe on pipe or flange on pipe; else ""
     """
 
@@ -69,53 +74,84 @@ class Piece:
     bodies: tuple[int, int]
     side: str = ""
     walls: tuple[float, float] = (0.0, 0.0)
+    thick: tuple[float, float] = (0.0, 0.0)
     pipe: str = ""
 
 
 def joints_of(shape: Any) -> list[list[Piece]]:
     """Return the joints of a shape: see `joints_between`."""
-    return joints_between([Solid(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
+    return joints_between([Solid(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)], [])
 
 
-def joints_between(bodies: Sequence[Solid]) -> list[list[Piece]]:
+def joints_between(bodies: Sequence[Solid], notes: list[str], names: Sequence[str] = ()) -> list[list[Piece]]:
     """Find the joints between bodies, and where there are none those inside each of them.
 
-    Each is the list of its pieces in the order of travel.
+    Each is the list of its pieces in the order of travel. The pairs of bodies at which OpenCascade fails are left out,
+    and named in a sentence that is added to `notes`.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece
     may end; each stretch between two crossings is a joint or is none.
 
+    After MOST_S those that are found are returned, of the largest bodies first, with a sentence in `notes`.
+
     Raises:
-        InputError: they are not found within MOST_S.
+        InputError: none is found by then.
     """
     begin = time.process_time()
-    found: list[list[Piece]] = []
-    for i, j in combinations(range(len(bodies)), 2):
-        a, b = bodies[i], bodies[j]
-        if _far(a, b):
-            continue
-        pieces: list[Piece] = []
-        for f in a.faces:
-            if _far(f, b):
-                continue
-            _check_time(begin, bodies)
-            for g in b.faces:
-                if not _far(f, g):
-                    pieces += _met(bodies, (i, j), f, g)
-                    pieces += _flush(bodies, (i, j), f, g)
-        found += chains(pieces)
-    if not found:
-        found = [chain for k in range(len(bodies)) for chain in chains(_within(bodies, k, begin))]
+    by_pair, failed = dict[tuple[int, ...], list[list[Piece]]](), list[str]()
+
+    def search(pairs: Sequence[tuple[int, ...]], pieces: Callable[[tuple[int, ...]], Iterable[Piece]]) -> None:
+        for count, pair in enumerate(pairs):
+            try:
+                by_pair[pair] = chains(pieces(pair))
+            except _TimeUpError:
+                if not any(by_pair.values()):
+                    raise InputError(
+                        f"The joints between {sum(len(body.faces) for body in bodies)} faces are not found within"
+                        f" {MOST_S:.0f} s of processor time: export only {WELDED}."
+                    ) from None
+                notes.append(
+                    f"The joints of {count} of {len(pairs)} {'pairs of ' * (len(pair) > 1)}bodies were found within"
+                    f" {MOST_S:.0f} s of processor time, of the largest. For the others export only {WELDED}."
+                )
+                return
+            except Exception as error:
+                if not of_opencascade(error):
+                    raise
+                failed.append(" and ".join(called(names, k) for k in pair))
+
+    size = [float(np.linalg.norm(body.high - body.low)) for body in bodies]
+    near = [(i, j) for i, j in combinations(range(len(bodies)), 2) if not _far(bodies[i], bodies[j])]
+    search(sorted(near, key=lambda pair: -min(size[k] for k in pair)), lambda pair: _pair(bodies, pair, begin))
+    if not any(by_pair.values()):
+        search([(k,) for k in range(len(bodies))], lambda pair: _within(bodies, pair[0], begin))
+    if failed:
+        notes.append(f"OpenCascade finds no joints of {listed(failed)}: repair their surfaces and export them again.")
+    found = [chain for pair in sorted(by_pair) for chain in by_pair[pair]]  # numbered as the file has the bodies
     return [_named(chain, found) for chain in found]
 
 
-def _check_time(begin: float, bodies: Sequence[Solid]) -> None:
+def _pair(bodies: Sequence[Solid], pair: tuple[int, ...], begin: float) -> Iterable[Piece]:
+    """Return the pieces between two bodies."""
+    i, j = pair
+    a, b = bodies[i], bodies[j]
+    for f in a.faces:
+        if _far(f, b):
+            continue
+        _check_time(begin)
+        for g in b.faces:
+            if not _far(f, g):
+                yield from _met(bodies, (i, j), f, g)
+                yield from _flush(bodies, (i, j), f, g)
+
+
+class _TimeUpError(Exception):
+    """The joints are not found within MOST_S."""
+
+
+def _check_time(begin: float) -> None:
     if time.process_time() - begin > MOST_S:
-        faces = sum(len(body.faces) for body in bodies)
-        raise InputError(
-            f"The joints between {faces} faces are not found within {MOST_S:.0f} s of processor time: export only"
-            " the bodies that are welded, without threads, holes and purchased parts."
-        )
+        raise _TimeUpError
 
 
 def _within(bodies: Sequence[Solid], k: int, begin: float) -> Iterable[Piece]:
@@ -123,7 +159,7 @@ def _within(bodies: Sequence[Solid], k: int, begin: float) -> Iterable[Piece]:
     for edge, met in bodies[k].edges:
         if len(met) != 2:
             continue
-        _check_time(begin, bodies)
+        _check_time(begin)
         f, g = met
         curve = BRepAdaptor_Curve(edge)
         line = sampled(curve, curve.FirstParameter(), curve.LastParameter())
@@ -287,7 +323,7 @@ def _cut(
         return None
     two = bodies[pair[0]], bodies[pair[1]]
     angle = math.pi - math.acos(cos)
-    thick, wall, goes_on = [], [], []
+    deep, wall, goes_on = [], [], []
     for k in (0, 1):
         skin = x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k]
         wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k])[0])
@@ -299,16 +335,16 @@ def _cut(
         # A ray meets a hole at a few places, the hollow of a tube at most.
         shares = (-0.4, -0.2, 0.2, 0.4) if f.flat and g.flat else ()
         places = [x + share * length * t + back for share in shares]
-        thick.append(float(np.median([exits[0], *(IN_MM + two[k].through(p, -ways[1 - k])[0] for p in places)])))
+        deep.append(float(np.median([exits[0], *(IN_MM + two[k].through(p, -ways[1 - k])[0] for p in places)])))
     if any(goes_on):
         k = goes_on.index(True)
-        kind, side = ("lap" if wall[k] < thick[k] else "T"), ""
+        kind, side = ("lap" if wall[k] < deep[k] else "T"), ""
     elif angle < NARROW_RAD:
         # A bevelled wall ends in an obtuse corner: there is material beyond its end.
         ends = [x + (wall[k] + 0.3) * ways[k] - 1.2 * normals[k] for k in (0, 1)]
         kind, side = ("V" if all(two[k].holds(ends[k]) for k in (0, 1)) else "HV"), ""
     else:
-        narrow = [wall[k] < thick[k] for k in (0, 1)]
+        narrow = [wall[k] < deep[k] for k in (0, 1)]
         kind, side = "corner", "outside" if all(narrow) else "inside"
         if narrow[0] != narrow[1]:
             k = narrow.index(True)  # the wall is the edge of a sheet: on another sheet, or beside a thinner one
@@ -317,7 +353,10 @@ def _cut(
     pipe = _of_pipe(f, g, t, two) if f.round or g.round else ""
     pipe = "" if kind == "lap" and pipe != "pipe on pipe" else pipe
     walls = wall[0], wall[1]
-    return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
+    roots = [x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k] for k in (0, 1)]
+    thick = tuple(0.1 + two[k].through(roots[k], -normals[k])[0] for k in (0, 1))
+    found = {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls}
+    return found | {"thick": thick, "pipe": pipe}
 
 
 def _coaxial(a: SolidFace, b: SolidFace, angle_rad: float) -> bool:
@@ -372,7 +411,15 @@ def _flush(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: Soli
             kind = "edge" if all(narrow) else "corner" if any(narrow) else "butt"
             side, walls = ("outside" if kind == "corner" else ""), (depth[0], depth[1])
             yield Piece(
-                line=line, up=n, type=kind, angle=math.pi, gap=max(0.0, gap), bodies=pair, side=side, walls=walls
+                line=line,
+                up=n,
+                type=kind,
+                angle=math.pi,
+                gap=max(0.0, gap),
+                bodies=pair,
+                side=side,
+                walls=walls,
+                thick=walls,
             )
 
 

@@ -149,13 +149,15 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     if mesh.volume < 0.0:
         mesh = mesh.flipped()
     bodies = int(body.max()) + 1
-    edges, joints = mesh_edges(mesh), tuple[PartJoint, ...]()
+    edges, joints, notes = mesh_edges(mesh), tuple[PartJoint, ...](), list[str]()
     if find_spec("OCP") is not None:  # without OpenCascade no joints are looked for
         from weldcal.models.workpieces.joints import joints_between
         from weldcal.models.workpieces.step import with_joints
 
-        edges, joints = with_joints(edges, joints_between(_solids(mesh, body)))
-    return PartShape(path.name, mesh, edges, unit_m, bodies, joints)
+        edges, joints = with_joints(edges, joints_between(_solids(mesh, body), notes))
+    return PartShape(
+        name=path.name, mesh=mesh, edges=edges, unit_m=unit_m, bodies=bodies, joints=joints, notes=tuple(notes)
+    )
 
 
 def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:

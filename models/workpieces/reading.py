@@ -6,7 +6,9 @@ import pickle
 import resource
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import file_digest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,7 +22,7 @@ LEAST_SIZE_M, LARGEST_SIZE_M = 0.005, 10.0
 STEP_SUFFIXES = (".step", ".stp")
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
 LARGE_BYTES = 250_000  # a file from here on is read in a process of its own
-MOST_S = 60  # of processor time for it: OpenCascade may go on for ever, and answers no signal then
+MOST_S = 45  # of processor time for it: OpenCascade may go on for ever, and answers no signal then
 
 
 def read_shape(path: Path, units: str | None = None) -> PartShape:
@@ -36,19 +38,31 @@ def read_shape(path: Path, units: str | None = None) -> PartShape:
     if units is not None and units not in UNITS_M:
         raise InputError(f"units must be {', '.join(UNITS_M)}, not '{units}'.")
     files = (path, *referenced(path)) if path.is_file() else (path,)
-    return _read(path, units, tuple(_stamp(file) for file in files))
+    return _read(tuple(_Written(file, file.name, *_content(file)) for file in files), units)
 
 
-def _stamp(file: Path) -> tuple[Path, int, int]:
-    found = file.stat() if file.is_file() else None
-    return (file, 0, 0) if found is None else (file, found.st_mtime_ns, found.st_size)
+@dataclass(frozen=True)
+class _Written:
+    """A file by its name and content: a copy of it, as in a cell's folder, is the same."""
+
+    path: Path = field(compare=False)
+    name: str
+    size: int
+    digest: bytes
+
+
+def _content(file: Path) -> tuple[int, bytes]:
+    if not file.is_file():
+        return 0, b""
+    with file.open("rb") as content:
+        return file.stat().st_size, file_digest(content, "sha256").digest()
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, units: str | None, written: tuple[tuple[Path, int, int], ...]) -> PartShape:
-    """Read a part once while its files, with their times and sizes, stay as they are; each plan asks for it."""
-    size = sum(written_size for _, _, written_size in written)
-    shape = _bounded(path, units) if size > LARGE_BYTES else _parsed(path, units)
+def _read(files: tuple[_Written, ...], units: str | None) -> PartShape:
+    """Read a part once while its files stay as they are; each plan asks for it."""
+    path = files[0].path
+    shape = _bounded(path, units) if sum(file.size for file in files) > LARGE_BYTES else _sure(path, units)
     _check_size(path, shape)
     return shape
 
@@ -63,6 +77,20 @@ def _parsed(path: Path, units: str | None) -> PartShape:
         return read_mesh_shape(path, UNITS_M[units or "mm"])
     kinds = ", ".join((*STEP_SUFFIXES, *MESH_SUFFIXES))
     raise InputError(f"'{path.name}' is no part that can be read: give a file that ends in {kinds}.")
+
+
+def _sure(path: Path, units: str | None) -> PartShape:
+    """Read a part. Raises InputError also where OpenCascade ends with an exception of its own."""
+    try:
+        return _parsed(path, units)
+    except Exception as error:
+        if type(error).__module__.split(".")[0] != "OCP":
+            raise
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise InputError(
+            f"OpenCascade cannot evaluate '{path.name}' ({what}): repair the part in the CAD program, as by exporting"
+            " only the bodies that are welded."
+        ) from error
 
 
 def _bounded(path: Path, units: str | None) -> PartShape:
@@ -94,7 +122,7 @@ def send(path: str, units: str | None, result: str) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_S, MOST_S + 1))
     try:
-        found: PartShape | InputError = _parsed(Path(path), units)
+        found: PartShape | InputError = _sure(Path(path), units)
     except InputError as error:
         found = error
     Path(result).write_bytes(pickle.dumps(found))

@@ -57,6 +57,7 @@ class PartJoint:
     angle_rad through the free space; pi where the faces are flush
     gap_m     largest gap between the bodies
     walls_m   extent of the two walls from the root; of flush faces their depth
+    thick_m   of the two bodies at the root, under these walls
     up_P      (3,) unit, out of the joint, in the middle of its longest edge
     side      left or right of a web, inside or outside of a corner; else ""
     closed    it ends where it begins
@@ -69,17 +70,19 @@ class PartJoint:
     angle_rad: float
     gap_m: float = 0.0
     walls_m: tuple[float, float] = (0.0, 0.0)
+    thick_m: tuple[float, float] = (0.0, 0.0)
     up_P: Floats
     side: str = ""
     closed: bool = False
     bodies: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PartShape:
     """A part in its frame P, m.
 
-    Its mesh, its edges by ascending id, the file's unit in m, its bodies and its joints.
+    Its mesh, its edges by ascending id, the file's unit in m, its bodies, its joints, and in notes what its reader
+    changed or left out, in sentences.
     """
 
     name: str
@@ -88,6 +91,7 @@ class PartShape:
     unit_m: float
     bodies: int = 1
     joints: tuple[PartJoint, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def edge(self, id: int) -> PartEdge:
         """Return the edge with this number.

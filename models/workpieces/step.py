@@ -17,7 +17,7 @@ from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 
 if TYPE_CHECKING:
-    from weldcal.models.workpieces.brep import SolidFace
+    from weldcal.models.workpieces.brep import Solid, SolidFace
     from weldcal.models.workpieces.joints import Piece
 
 Floats = npt.NDArray[np.float64]
@@ -25,6 +25,7 @@ Floats = npt.NDArray[np.float64]
 LARGEST_STEP = 512 * 1024**2
 CHORD_MM, FACET_RAD = 0.02, 0.05  # largest distance and angle between the mesh and the surface
 LEAST_EDGE_MM = 1e-6
+SEWN_MM = 0.1  # between surfaces that are sewn: below the gap that a weld notices
 SMOOTH_RAD = math.radians(2.0)
 _MERGED_M = 1e-7
 _EXTERNAL = re.compile(
@@ -45,13 +46,23 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
     for file in (path, *referenced(path)):
         _check_text(file)
     shape, unit, names = _transferred(path)
-    from weldcal.models.workpieces.joints import joints_of
+    from weldcal.models.workpieces.joints import joints_between
 
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
-    mesh, bodies = _mesh(shape, path)
-    edges, joints = with_joints(_edges(shape), joints_of(shape), names)
-    return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
+    notes = list[str]()
+    shape, bodies, names = _sound(_closed(shape, path, notes), names, path, notes)
+    mesh = _mesh(shape, path)
+    edges, joints = with_joints(_edges(shape), joints_between(bodies, notes, names), names)
+    return PartShape(
+        name=path.name,
+        mesh=mesh,
+        edges=edges,
+        unit_m=UNITS_M[unit or units or "mm"],
+        bodies=len(bodies),
+        joints=joints,
+        notes=tuple(notes),
+    )
 
 
 def referenced(path: Path) -> list[Path]:
@@ -172,8 +183,112 @@ def _assembled(path: Path) -> Any:
     return XCAFDoc_DocumentTool.ShapeTool_s(document.Main()).GetOneShape()
 
 
-def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
-    """Return the fine mesh of all solids, m, and their number."""
+def _closed(shape: Any, path: Path, notes: list[str]) -> Any:
+    """Return a shape with its solids; surfaces without any are sewn to some where they close within SEWN_MM.
+
+    Raises:
+        InputError: they do not, with the number of their free edges and the widest gap.
+    """
+    from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeSolid, BRepBuilderAPI_Sewing
+    from OCP.BRepLib import BRepLib
+    from OCP.TopAbs import TopAbs_ShapeEnum
+    from OCP.TopoDS import TopoDS
+
+    from weldcal.models.workpieces.brep import parts_of
+
+    faces = parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE)
+    if parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID):
+        return shape
+    if not faces:
+        raise InputError(f"'{path.name}' holds no solid and no surface, only lines: export the part as a solid.")
+    sewing = BRepBuilderAPI_Sewing(SEWN_MM)
+    for face in faces:
+        sewing.Add(face)
+    sewing.Perform()
+    shells = parts_of(sewing.SewedShape(), TopAbs_ShapeEnum.TopAbs_SHELL)
+    free = [TopoDS.Edge(sewing.FreeEdge(k + 1)) for k in range(sewing.NbFreeEdges())]
+    if free or not shells:
+        gap = _widest_gap(free)
+        raise InputError(
+            f"'{path.name}' holds no solid, and its {len(faces)} surfaces do not close within {SEWN_MM:g} mm:"
+            f" {len(free)} edges are free, the widest gap is {gap:.3g} mm. Close it to a solid and export it again."
+        )
+    solids = []
+    for shell in shells:
+        solid = BRepBuilderAPI_MakeSolid(TopoDS.Shell(shell)).Solid()
+        BRepLib.OrientClosedSolid_s(solid)
+        solids.append(solid)
+    words = f"a solid (within {SEWN_MM:g} mm)" if len(solids) == 1 else f"{len(solids)} solids (within {SEWN_MM:g} mm)"
+    notes.append(f"The file holds surfaces only: {len(faces)} of them were sewn to {words}.")
+    return _compound(solids)
+
+
+def _widest_gap(free: Sequence[Any]) -> float:
+    """Return the largest distance, mm, from the middle of a free edge to the nearest of the others."""
+    from OCP.BRepAdaptor import BRepAdaptor_Curve
+
+    from weldcal.models.workpieces.brep import sampled
+
+    lines = [sampled(c, c.FirstParameter(), c.LastParameter()) for c in map(BRepAdaptor_Curve, free)]
+    fine = [
+        line[0] + np.linspace(0.0, 1.0, 65)[:, None] * (line[1] - line[0]) if len(line) == 2 else line for line in lines
+    ]
+    apart = [
+        min(
+            (float(np.linalg.norm(other - line[len(line) // 2], axis=1).min()) for other in fine if other is not line),
+            default=0.0,
+        )
+        for line in fine
+    ]
+    return max(apart, default=0.0)
+
+
+def _compound(shapes: Sequence[Any]) -> Any:
+    from OCP.BRep import BRep_Builder
+    from OCP.TopoDS import TopoDS_Compound
+
+    builder, found = BRep_Builder(), TopoDS_Compound()
+    builder.MakeCompound(found)
+    for shape in shapes:
+        builder.Add(found, shape)
+    return found
+
+
+def _sound(shape: Any, names: Sequence[str], path: Path, notes: list[str]) -> tuple[Any, list[Solid], list[str]]:
+    """Return a shape without the bodies that OpenCascade cannot evaluate, with its bodies and their names.
+
+    Raises:
+        InputError: it can evaluate none.
+    """
+    from OCP.TopAbs import TopAbs_ShapeEnum
+
+    from weldcal.models.workpieces.brep import Solid, called, listed, of_opencascade, parts_of
+
+    solids = parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)
+    found, left, why = dict[int, Solid](), list[str](), ""
+    for k, solid in enumerate(solids):
+        try:
+            found[k] = Solid(solid)
+            _edges(solid)
+        except Exception as error:
+            if not of_opencascade(error):
+                raise
+            found.pop(k, None)
+            left.append(called(names, k))
+            why = type(error).__name__
+    if not found:
+        raise InputError(
+            f"OpenCascade cannot evaluate the surfaces of '{path.name}' ({why}): repair the part and export it again."
+        )
+    if left:
+        notes.append(f"Left out, for OpenCascade cannot evaluate its surfaces ({why}): {listed(left)}.")
+        shape = _compound([solids[k] for k in found])
+        names = [names[k] if k < len(names) else "" for k in found]
+    return shape, list(found.values()), list(names)
+
+
+def _mesh(shape: Any, path: Path) -> TriMesh:
+    """Return the fine mesh of all solids, m."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
@@ -182,11 +297,6 @@ def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
 
     from weldcal.models.workpieces.brep import parts_of
 
-    bodies = len(parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID))
-    if not bodies:
-        raise InputError(
-            f"'{path.name}' holds no solid (only surfaces or lines): close it to a solid and export it again."
-        )
     BRepMesh_IncrementalMesh(shape, CHORD_MM, False, FACET_RAD, False)
     pieces = []
     for found in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE):
@@ -203,7 +313,7 @@ def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
         pieces.append(TriMesh(1e-3 * points, triangles))
     if not pieces:
         raise InputError(f"The surfaces of '{path.name}' cannot be meshed: repair the part and export it again.")
-    return merge(*pieces, tolerance_m=_MERGED_M), bodies
+    return merge(*pieces, tolerance_m=_MERGED_M)
 
 
 def _edges(shape: Any) -> tuple[PartEdge, ...]:
@@ -259,11 +369,16 @@ def with_joints(
     from weldcal.models.workpieces.joints import closes
 
     known, joints = list(edges), []
+    ends = np.array([edge.points_P[[0, -1]] for edge in edges]).reshape(-1, 2, 3)
+    closed = np.array([edge.closed for edge in edges], dtype=bool)
     for chain in chains:
         ids = []
         for piece in chain:
             kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
-            lies = (k for k, edge in enumerate(known) if edge.up_P is None and _is(edge, 1e-3 * piece.line))
+            line = 1e-3 * piece.line
+            apart = [np.abs(ends - line[some]).max(axis=(1, 2)) for some in ([0, -1], [-1, 0])]
+            near = np.flatnonzero(closed | (np.minimum(*apart) < 2e-5)).tolist()
+            lies = (k for k in near if known[k].up_P is None and _is(known[k], line))
             at = next(lies, len(known))
             radius = known[at].radius_m if at < len(known) else None
             line = known[at].points_P if at < len(known) else 1e-3 * piece.line
@@ -278,6 +393,7 @@ def with_joints(
                 angle_rad=longest.angle,
                 gap_m=1e-3 * max(piece.gap for piece in chain),
                 walls_m=(1e-3 * longest.walls[0], 1e-3 * longest.walls[1]),
+                thick_m=(1e-3 * longest.thick[0], 1e-3 * longest.thick[1]),
                 up_P=longest.up,
                 side=longest.side,
                 closed=closes(chain),

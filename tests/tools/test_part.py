@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def a_post(folder: Path) -> tuple[Path, PartJoint]:
 def answers(monkeypatch: pytest.MonkeyPatch, poses: list[set[int]]) -> None:
     """Let the arm weld in each pose of the part only some edges, each alone."""
 
-    def places(scenario: Scenario, apart: bool = False, advises: bool = False) -> object:
+    def places(scenario: Scenario, apart: bool = False, advises: bool = False, until_s: float = 0.0) -> object:
         asked = scenario.workpiece.seams  # type: ignore[union-attr]
         alone = {seam.edges[0]: k for k, seam in enumerate(asked) if len(seam.edges) == 1}
         found = [
@@ -320,15 +321,73 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
         seam_of(shape, SeamSource(edges=(outside,)), "fillet")
 
 
-def test_after_a_minute_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seams_are_ranked_as_a_welder_would(tmp_path: Path) -> None:
+    """A long thick rib, a short one, then a bolt by its name and a board on it that is ten times as thick as its tube."""
+    bodies = {
+        "base": box((0, 0, -10), (600, 400, 10)),
+        "M10 bolt": cylinder((500, 350, 0), 60, 30),
+        "rib": box((50, 60, 0), (150, 10, 40)),
+        "long rib": box((50, 200, 0), (300, 10, 40)),
+        "sheet": box((50, 330, 0), (350, 1.5, 40)),
+    }
+    write_step(assembly(*bodies.values()), tmp_path / "a.step")
+    text = (tmp_path / "a.step").read_text()
+    for k, name in enumerate(bodies):
+        text = re.sub(rf"'Open CASCADE STEP translator [\d.]+ \d+\.{k + 1}'", f"'{name}'", text)
+    (tmp_path / "a.step").write_text(text)
+    seams = ranked(read_shape(tmp_path / "a.step"), load_tool(WELDING).tool)
+    order = list(dict.fromkeys(seam.joint.bodies[1] for seam in seams))
+    assert order[:2] == ["long rib", "rib"]
+    assert [round(1e3 * v) for v in seams[0].joint.thick_m] == [10, 10]
+
+
+def test_of_a_ring_of_edges_those_that_the_tool_fits_are_offered(tmp_path: Path) -> None:
+    """A square post with a wall beside one of its four sides."""
+    post, wall = box((0, 0, 0), (160, 160, 80)), box((-40, -100, 0), (10, 360, 120))
+    write_step(assembly(box((-150, -150, -10), (500, 460, 10)), post, wall), tmp_path / "post.step")
+    shape = read_shape(tmp_path / "post.step")
+    around = {e.id for e in shape.edges if e.points_P.min() > -1e-6 and e.points_P.max() < 0.16 + 1e-6}
+    seam = next(s for s in ranked(shape, load_tool(WELDING).tool) if set(s.joint.edges) <= around)
+    assert (seam.reason, len(seam.refused)) == ("", 1)
+    (id,) = seam.refused
+    assert shape.edge(id).points_P[:, 0] == pytest.approx(0.0)
+    assert "The tool does not fit" in seam.refused[id]
+
+
+def test_equal_seams_are_one_line(tmp_path: Path) -> None:
+    plates = [box((0, 0, -10), (700, 200, 10)), *(box((60 + 180 * k, 20, 0), (10, 150, 40)) for k in range(4))]
+    write_step(assembly(*plates), tmp_path / "ribs.step")
+    words = ["part", str(tmp_path / "ribs.step"), "--plan", "0", "--out", str(tmp_path / "out")]
+    printed = " ".join(CliRunner().invoke(app, words).stdout.split())
+    assert "the tool fits 4 seams" in printed
+    assert re.search(r"seam 1 .* 3 like it: edge", printed)
+    result = CliRunner().invoke(app, [*words, "--json", "--overwrite"])
+    likes = [seam["like"] for seam in json.loads(result.stdout.splitlines()[-1])["seams"]]
+    assert likes == [1, 1, 1, 1]
+
+
+def test_after_its_time_the_other_seams_are_not_planned(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shape = read_shape(step)
-    monkeypatch.setattr(new, "offered", lambda *_: ([], {1: "Too near."}))
     seams = ranked(shape, load_tool(WELDING).tool)
-    for most, count in ((60.0, 2), (0.0, 1)):
-        monkeypatch.setattr(new, "MOST_PLANNING_S", most)
-        monkeypatch.setattr(new, "process_time", iter((0.0, 0.0, 1.0)).__next__)
+    for count in (2, 1):
+        answers = iter([([], {1: "Too near."})] * count)
+
+        def offered(*_: object, answers: Iterator[object] = answers, **__: object) -> object:
+            if (answer := next(answers, None)) is None:
+                raise new.OutOfTimeError
+            return answer
+
+        monkeypatch.setattr(new, "offered", offered)
         found = with_plans(shape, seams, 10, step, None, WELDING, lambda stage, share: None)
         assert sorted(seam.planned for seam in found) == [False] * (2 - count) + [True] * count
+
+
+def test_no_place_is_looked_for_after_the_time(step: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time is that of the command with the process that reads the part."""
+    monkeypatch.setattr(new, "MOST_PART_S", 0.0)
+    seams = ranked(read_shape(step), load_tool(WELDING).tool)
+    found = with_plans(read_shape(step), seams, 10, step, None, WELDING, lambda stage, share: None)
+    assert not any(seam.planned for seam in found)
 
 
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Computes the tool's chord and axes on the seam, its roll rate, its path along a seam, and the least pipe for it."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -193,6 +194,7 @@ def check_ring(
     check_travel(seam, config)
 
 
+@lru_cache(maxsize=64)
 def least_pipe_m(tool: WeldingTool, wall_m: float, lean_rad: float = 0.0) -> float:
     """Diameter m of the least pipe whose outside the tool can weld onto a plate, both as far as `wall_m` from the seam.
 

@@ -194,7 +194,7 @@ def test_parts_that_stand_apart_are_refused_before_the_arc_with_what_was_found()
     X_BC = looking(eye, X[:3, 3])
     cloud = (scan([*put(solids, X), TABLE, FLOOR], X_BC, np.random.default_rng(4)) - X_BC[:3, 3]) @ X_BC[:3, :3]
     model, seam = drawn("lap")
-    part = Part(PartShape("lap", model.mesh, (), 1.0), seam)
+    part = Part(PartShape(name="lap", mesh=model.mesh, edges=(), unit_m=1.0), seam)
     given = replace(planning(), workpiece=part, X_BP_guess=RigidTransform(X), limits=limits)
     seen = Scan(sequence=1, points_C=cloud.astype(np.float32))
     plan = plan_seam(given, seen, RigidTransform(X_BC), ScannerCorrection())
@@ -261,7 +261,7 @@ def test_a_fresh_cells_first_plan_lies_within_its_sigma(monkeypatch: pytest.Monk
     X_BC = looking(np.array([0.65, 0.0, 0.95]), X[:3, 3])
     cloud = (scan([*put(parts("fillet", 0.0, 0.0, 0.0), X), TABLE, FLOOR], X_BC, rng) - X_BC[:3, 3]) @ X_BC[:3, :3]
     model, seam = drawn("fillet")
-    part = Part(PartShape("fillet", model.mesh, (), 1.0), seam)
+    part = Part(PartShape(name="fillet", mesh=model.mesh, edges=(), unit_m=1.0), seam)
     press = part.press(TOOL, None, None)
     tool = replace(TOOL, press_axial_m=press.axial_m, press_lateral_m=press.lateral_m)
     given = replace(planning(), workpiece=part, tool=tool, X_BP_guess=RigidTransform(X))

@@ -31,7 +31,7 @@ def plates() -> Part:
     )
     line = np.array([[-0.1, 0.0, 0.01], [0.1, 0.0, 0.01]])
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
-    return Part(PartShape("plates", mesh, (), 1.0), draw_seam(mesh, line, "butt", up))
+    return Part(PartShape(name="plates", mesh=mesh, edges=(), unit_m=1.0), draw_seam(mesh, line, "butt", up))
 
 
 def _near(

@@ -2,13 +2,13 @@
 
 import dataclasses as dc
 import json
+import math
 import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import process_time
 from typing import Annotated, Any
 
 import typer
@@ -26,7 +26,14 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, ToolFile, WorkpieceConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.scan_poses import TURNS_DEG, add_scan_poses, standing, weldable_places
+from weldcal.tools.commands.cell.scan_poses import (
+    TURNS_DEG,
+    OutOfTimeError,
+    add_scan_poses,
+    standing,
+    used_s,
+    weldable_places,
+)
 from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.cell.screen import Offer, joint_of, least_pipe, ranked, unfit, unit_hint, ways, without
 from weldcal.tools.report.first_screen import typed
@@ -82,7 +89,7 @@ HEAD = """# yaml-language-server: $schema={schema}
 TOOL = "tool.yaml"
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
 MOST_TRIED = 4  # seams of a part for which a place is looked for
-MOST_PLANNING_S = 60.0  # of processor time for the seams of a part: a choice, a user waits no longer
+MOST_PART_S = 32.0  # of processor time of weldcal part with its planning: a choice, a user waits no longer
 
 
 RUNS = """# A cell of your own. It runs as it is, in simulation:
@@ -235,7 +242,12 @@ def _comment(text: str) -> str:
 
 
 def offered(
-    path: Path, scenario: Scenario, shape: PartShape, ids: Sequence[int], joint: str | None = None
+    path: Path,
+    scenario: Scenario,
+    shape: PartShape,
+    ids: Sequence[int],
+    joint: str | None = None,
+    until_s: float = math.inf,
 ) -> tuple[list[Offer], dict[int, str]]:
     """Say what of a part's edges the arm of a cell can weld: the one rule of `part`, its page and `new`.
 
@@ -245,9 +257,13 @@ def offered(
         shape: the part.
         ids: edges, as far as possible in the order of travel.
         joint: of the seams; None: by the angle.
+        until_s: by `used_s`, after which nothing is planned.
 
     Returns:
         What can be welded, each with the part in one pose, the longest first, and why not by edge.
+
+    Raises:
+        OutOfTimeError: not done until then.
     """
     spec, refused = scenario.workpiece, dict[int, str]()
     assert spec is not None
@@ -255,7 +271,7 @@ def offered(
     try:
         for seams, note, apart in ways(shape, ids):
             scenario.workpiece = dc.replace(spec, seams=seams, joint=kind)
-            places, why = weldable_places(_loaded(path, scenario), apart)
+            places, why = weldable_places(_loaded(path, scenario), apart, until_s=until_s)
             reasons = {id: why[k] for k, seam in enumerate(seams) for id in seam.edges if k in why}
             found = list[Offer]()
             for pose, chosen in places or [(spec.pose_guess, list(range(len(seams))))]:
@@ -282,22 +298,24 @@ def offered(
 
 
 def planned(
-    part: OwnPart, chains: list[tuple[int, ...]], tool: Path, progress: Progress
+    part: OwnPart, chains: list[tuple[int, ...]], tool: Path, progress: Progress, began_s: float | None = None
 ) -> list[tuple[list[Offer], dict[int, str]]]:
     """Say of each chain of a part's edges what a new cell's arm can weld of it, as `offered`.
 
-    After MOST_PLANNING_S the rest of the chains is not asked.
+    MOST_PART_S after `began_s`, by `used_s`, the rest of the chains is not asked; without it, after this call.
     """
-    found, began = list[tuple[list[Offer], dict[int, str]]](), process_time()
+    until_s = MOST_PART_S + (used_s() if began_s is None else began_s)
+    found = list[tuple[list[Offer], dict[int, str]]]()
     with TemporaryDirectory() as folder:
         scenario, shape = load_scenario(BASE), read_shape(part.file, part.units)
         add_part(scenario, Path(folder), dc.replace(part, edges=chains[0]), load_tool(tool).tool)
         add_tool(scenario, Path(folder), tool)
         for k, ids in enumerate(chains):
-            if process_time() - began > MOST_PLANNING_S:
-                break
             progress(f"plan seam {k + 1} of {len(chains)}", 0.3 + 0.6 * k / len(chains))
-            found.append(offered(Path(folder) / CELL, scenario, shape, ids))
+            try:
+                found.append(offered(Path(folder) / CELL, scenario, shape, ids, until_s=until_s))
+            except OutOfTimeError:
+                break
     return found
 
 

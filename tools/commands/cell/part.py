@@ -17,9 +17,11 @@ from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import MOST_LINES, RESULT, Call, Outcome, command, option
 from weldcal.tools.commands.cell.new import OwnPart, planned
+from weldcal.tools.commands.cell.scan_poses import used_s
 from weldcal.tools.commands.cell.screen import (
     Offer,
     Seam,
+    alike,
     by_reason,
     edges_text,
     outside_hint,
@@ -57,35 +59,48 @@ def part(
     ] = MOST_PLANNED,
 ) -> Outcome:
     """List the seams of a part that a new cell's arm can weld, with the numbers of their edges, and show them in 3D."""
+    began_s = used_s()
     call.progress("find the seams", 0.0)
     shape = read_shape(file, units)
     call.progress("fit the tool", 0.2)
     seams = ranked(shape, load_tool(tool_file(tool)).tool)
-    seams = with_plans(shape, seams, plan, file, units, tool_file(tool), call.progress)
+    seams = with_plans(shape, seams, plan, file, units, tool_file(tool), call.progress, began_s)
     call.progress("draw", 0.9)
     folder = call.folder("part", file.name)
     more = [] if tool == WELDING else ["--tool-file", shlex.quote(str(tool))]
     more += [] if units is None else ["--units", units]
 
-    def make(offer: Offer) -> str:
-        return typed("new my_cell --part", file, "--edges", ",".join(map(str, offer.edges)), *more)
+    def make(edges: Sequence[int]) -> str:
+        return typed("new my_cell --part", file, "--edges", ",".join(map(str, edges)), *more)
 
     write_part(shape, seams, folder, make)
-    summary = {**as_json(shape, folder), "seams": [seam.as_row() for seam in seams]}
-    first = next((offer for seam in seams for offer in seam.offers), None)
+    groups = alike(seams)
+    first_like = {k: group[0] + 1 for group in groups for k in group}
+    rows = [{**seam.as_row(), "like": first_like[k]} for k, seam in enumerate(seams)]
+    summary = {**as_json(shape, folder), "seams": rows}
+    first = next((tuple(offer.edges) for seam in seams for offer in seam.offers), None)
+    if first is None and plan > 0:  # no time was left to ask the arm
+        first = next((seam.joint.edges for seam in seams if not seam.reason and not seam.planned), None)
     following = "" if first is None else make(first)
     shown = partial(emit_table, shape, seams, folder, following, file, call.verbose)
     return Outcome({**summary, "next": following}, text=shown)
 
 
 def with_plans(
-    shape: PartShape, seams: list[Seam], most: int, file: Path, units: str | None, tool: Path, progress: Progress
+    shape: PartShape,
+    seams: list[Seam],
+    most: int,
+    file: Path,
+    units: str | None,
+    tool: Path,
+    progress: Progress,
+    began_s: float | None = None,
 ) -> list[Seam]:
-    """The seams with what a new cell's arm can weld of the first of them, as `weldcal new` asks it."""
+    """The seams with what a new cell's arm can weld of the first of them, as `weldcal new` asks it; see `planned`."""
     asked = seams[:most]
     if not asked:
         return seams
-    answers = planned(OwnPart(file, units=units), [seam.joint.edges for seam in asked], tool, progress)
+    answers = planned(OwnPart(file, units=units), [seam.joint.edges for seam in asked], tool, progress, began_s)
     found = []
     for seam, (offers, refused) in zip(asked, answers, strict=False):
         each = [f"{edges_text(ids)}: {why}" if len(refused) > 1 else why for ids, why in by_reason(refused)]
@@ -121,6 +136,7 @@ def as_json(shape: PartShape, folder: Path) -> dict[str, object]:
         "file": shape.name,
         "unit": {1e-3: "mm", 1.0: "m"}.get(shape.unit_m, "inch"),
         "bodies": shape.bodies,
+        "notes": list(shape.notes),
         "size_mm": [float(v) for v in 1e3 * np.ptp(shape.mesh.vertices, axis=0)],
         "edges": [as_row(edge) for edge in shape.edges],
         "report": str(folder / PAGE),
@@ -131,15 +147,17 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path, following: str
     """Print what can be welded, the next command and the page; `verbose`: and each edge and refusal."""
     size = " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(shape.mesh.vertices, axis=0))
     about = {"part": f"{shape.name}: {size} mm, {shape.bodies} bod{'ies' if shape.bodies > 1 else 'y'}"}
-    last = {"note": outside_hint(shape), "unit": unit_hint(shape)}
+    last = {"note": " ".join(filter(None, [*shape.notes, outside_hint(shape)])), "unit": unit_hint(shape)}
     entries = page_rows(shape, seams)
     good, bad = ([e for e in entries if (e["state"] != "no") == wanted] for wanted in (True, False))
     last |= {"next": following or (typed("part", file) if good else ""), "page": f"{folder / PAGE} (-v: every edge)"}
+    kinds = [_kinds(some) for some in (good, bad)]
+    entries = [*kinds[0], *kinds[1]]
+    named = [f"{word} {k + 1}" for word, some in zip(("seam", "not"), kinds, strict=True) for k in range(len(some))]
     for shown in range(len(entries), -1, -1):
-        named = [f"seam {k + 1}" for k in range(len(good))] + [f"not {k + 1}" for k in range(len(bad))]
         rows = {
-            name: f"{e['named']}: {e['type']}, {e['length']} mm, {e['angle']} deg. {e['verdict']}"
-            for name, e in list(zip(named, [*good, *bad], strict=True))[:shown]
+            name: f"{e['named']}: {e['type']}, {e['length']} mm, {e['angle']} deg. {e['verdict']}{e['like']}"
+            for name, e in list(zip(named, entries, strict=True))[:shown]
         }
         more = {"more": f"{len(entries) - shown} more, on the page"} if shown < len(entries) else {}
         most = None if verbose or shown <= 1 else MOST_LINES
@@ -153,15 +171,30 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path, following: str
             typer.echo(f"{edge.id:>4}  {edge.kind:8}  {length:>9}  {angle:>9}  {radius:>9}  {ends}")
 
 
+def _kinds(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first entry of each type, length, angle and state, with how many are like it."""
+    found = dict[tuple[str, ...], list[dict[str, Any]]]()
+    for entry in entries:
+        kind = tuple(entry[key] for key in ("type", "length", "angle", "state"))
+        found.setdefault(kind, []).append(entry)
+    return [
+        {**some[0], "like": f" {len(some) - 1} like it: {', '.join(e['named'] for e in some[1:])}." * (len(some) > 1)}
+        for some in found.values()
+    ]
+
+
 def _headline(seams: list[Seam], good: list[dict[str, Any]]) -> str:
     asked = any(seam.planned for seam in seams)
     if not seams:
         return "no seams: no two bodies meet within 3 mm in a concave joint, and no body has a concave edge"
     if not good:
         return "no seam can be welded" if asked else "the tool fits no seam"
-    count = sum(len({tuple(one.edges) for one in o.seams}) for seam in seams for o in seam.offers) or len(good)
+    yes = sum(len({tuple(one.edges) for one in o.seams}) for seam in seams for o in seam.offers)
+    count = yes or len(good)
     what = f"{count} seam{'s' * (count > 1)}"
-    return f"{what} can be welded" if asked else f"the tool fits {what}; the arm was not asked (--plan 0)"
+    if yes or all(entry["state"] == "yes" for entry in good):
+        return f"{what} can be welded"
+    return f"the tool fits {what}; the arm was not asked ({'no time was left' if asked else '--plan 0, or no time'})"
 
 
 def _figures(edge: PartEdge) -> tuple[str, str, str]:
@@ -169,8 +202,8 @@ def _figures(edge: PartEdge) -> tuple[str, str, str]:
     return fixed(1e3 * edge.length_m, 2), angle, fixed(None if edge.radius_m is None else 1e3 * edge.radius_m, 2)
 
 
-def write_part(shape: PartShape, seams: list[Seam], folder: Path, make: Callable[[Offer], str]) -> None:
-    """Write edges.csv and the page; `make`: the command for an offer."""
+def write_part(shape: PartShape, seams: list[Seam], folder: Path, make: Callable[[Sequence[int]], str]) -> None:
+    """Write edges.csv and the page; `make`: the command for edges."""
     rows = [as_row(edge) for edge in shape.edges]
     table = [
         [" ".join(f"{v:.4f}" for v in cell) if isinstance(cell, list) else cell for cell in row.values()]
@@ -188,7 +221,7 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path, make: Callable
 
 
 def page_rows(
-    shape: PartShape, seams: list[Seam], make: Callable[[Offer], str] = lambda offer: ""
+    shape: PartShape, seams: list[Seam], make: Callable[[Sequence[int]], str] = lambda edges: ""
 ) -> list[dict[str, Any]]:
     """Return what is offered of each seam, and the edges that are refused with one reason, as the page shows them."""
     found = list[dict[str, Any]]()
@@ -208,7 +241,7 @@ def page_rows(
                 "verdict": verdict[:1].upper() + verdict[1:],
                 "state": state,
                 "text": "" if offer is None else offer.lines,
-                "command": "" if offer is None else make(offer),
+                "command": "" if offer is None else make(offer.edges),
             }
         )
 
@@ -216,7 +249,7 @@ def page_rows(
         for offer in seam.offers:
             add(seam, offer.edges, "yes", replace(seam, offers=(offer,)).verdict, offer)
         if not seam.planned and not seam.reason:
-            add(seam, seam.joint.edges, "fits", seam.verdict)
+            add(seam, [id for id in seam.joint.edges if id not in seam.refused], "fits", seam.verdict)
         refused = dict.fromkeys(seam.joint.edges, seam.reason) if not seam.planned and seam.reason else seam.refused
         for ids, why in by_reason(refused):
             add(seam, ids, "no", f"no: {seam.reason if len(seam.joint.edges) == 1 else why}")

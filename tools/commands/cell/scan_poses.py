@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,6 +39,7 @@ TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TRIED_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
 NO_END = 1.2  # times what a scanner shows: a longer part has no end in view, and is not looked for
+SCAN_S, SCAN_S_EACH = 8.0, 5e-4  # of processor time to find a part in a scan, and more for each of its triangles
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
 
@@ -194,8 +196,22 @@ def _refused(scenario: Scenario, station: Station, poses: list[Array]) -> str:
     return ""
 
 
+class OutOfTimeError(Exception):
+    """The time for planning is over."""
+
+
+def used_s() -> float:
+    """Return the processor time of this process and of those that have read a part for it, s."""
+    return sum(os.times()[:4])
+
+
+def _check_time(until_s: float, needs_s: float = 0.0) -> None:
+    if used_s() + needs_s > until_s:
+        raise OutOfTimeError
+
+
 def weldable_places(
-    scenario: Scenario, apart: bool = False, advises: bool = False
+    scenario: Scenario, apart: bool = False, advises: bool = False, until_s: float = math.inf
 ) -> tuple[list[tuple[PoseConfig, list[int]]], dict[int, str]]:
     """Find poses of a scenario's part on the table in which the arm can weld its seams.
 
@@ -205,9 +221,13 @@ def weldable_places(
         scenario: the cell, with a part that has these seams.
         apart: whether seams may be left out, and welded in different poses.
         advises: the reasons say what would help.
+        until_s: by `used_s`, when it has to be done.
 
     Returns:
         Each pose with the numbers of its seams, the longest first, and why the others are welded in none.
+
+    Raises:
+        OutOfTimeError: it is not done until then.
     """
     assert scenario.workpiece is not None
     count = len(scenario.workpiece.seams)
@@ -226,6 +246,7 @@ def weldable_places(
         middles = [0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))]
         middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > 0.005)]  # nearer they are one place
         for guess in (standing(part.mesh, turn, middle, scenario) for middle in middles for turn in TURNS_DEG):
+            _check_time(until_s)
             tried.append((guess, _refusals(scenario, station, seams, guess, apart)))
             if not tried[-1][1]:
                 break
@@ -243,6 +264,7 @@ def weldable_places(
             tried.remove(best)
             if not some or (len(some) < len(seams) and not apart):
                 break  # no pose welds more
+            _check_time(until_s, SCAN_S + SCAN_S_EACH * len(part.mesh.triangles))
             if unseen := _unseen(scenario, station, seams[some[0]], best[0]):
                 why |= dict.fromkeys(some, unseen)
             else:

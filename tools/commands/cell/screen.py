@@ -1,6 +1,7 @@
 """Which joints of a part a tool fits, why not the others, and in which pieces a seam may be welded."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,13 @@ SMALL_M = 0.012  # a part this small may be drawn in inches
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
+UNLIKE, LEAST_PLATE_M = 5.0, 8e-4  # ratio of two thicknesses that are not welded to each other; the least thickness
+MOST_PLATE_M = 0.012  # a plate thicker than this makes a seam no more important: a choice
+PURCHASED = re.compile(
+    r"bolt|screw|washer|rivet|cast[eo]r|\bnuts?\b|\bnut_|\b(din|iso|ansi)[ _]?\d{3}|\bm\d+ ?x ?\d|wood|\bmdf\b"
+    r"|schraube|mutter|scheibe",
+    re.IGNORECASE,
+)  # names of what is not welded
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
@@ -97,6 +105,7 @@ class Seam:
             "angle_deg": math.degrees(j.angle_rad),
             "gap_mm": 1e3 * j.gap_m,
             "least_radius_mm": None if self.radius_m is None else 1e3 * self.radius_m,
+            "plates_mm": [1e3 * thick for thick in j.thick_m],
             "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad) if j.walls_m[0] else None,
             "closed": j.closed,
             "weldable": not self.reason,
@@ -119,22 +128,48 @@ def side_of(edge: PartEdge) -> str:
 
 
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """Sort a part's joints: those that the tool can weld, the felt and the upward ones first, then the nearest misses.
+    """Sort a part's joints as a welder would: those that the tool can weld first, then the nearest misses.
 
-    The arm is not asked. Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
+    Of them purchased parts and plates of unlike thickness come last. The felt and the upward ones come first, then
+    those with the largest length times thinner plate. The arm is not asked.
+
+    Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
     """
     found = []
     for joint in shape.joints or _creases(shape):
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        reason, short_m, felt = _obstacle(shape, joint, tool) if shape.joints else ("", 0.0, True)
+        refused, felt = _obstacles(shape, joint, tool) if shape.joints else ({}, True)
+        short_m = max((short for _, short in refused.values()), default=0.0)
+        why, reason = {id: words for id, (words, _) in refused.items()}, ""
+        if refused and len(refused) < len(joint.edges):
+            short_m = 0.0  # the rest is welded
+        elif refused:
+            id, reason = next(iter(why.items()))
+            reason = f"edge {id}: {reason}" if len(refused) > 1 and reason.startswith("The tool does not") else reason
         radius = min(radii, default=None)
-        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt))
-    return sorted(found, key=_order)
+        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt, refused=why))
+    return sorted(found, key=lambda seam: _order(shape, seam))
 
 
-def _order(seam: Seam) -> tuple[Any, ...]:
-    above = seam.joint.up_P[2] > OPEN_ABOVE
-    return (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above, seam.short_m, -seam.joint.length_m)
+def _order(shape: PartShape, seam: Seam) -> tuple[Any, ...]:
+    j, thin, thick = seam.joint, min(seam.joint.thick_m), max(seam.joint.thick_m)
+    unlike = thick > 0.0 and (thin < LEAST_PLATE_M or thick > UNLIKE * thin)  # a board on a tube, a shaft in a sheet
+    unlikely = unlike or any(PURCHASED.search(name) for name in j.bodies)
+    length_m = j.length_m - sum(shape.edge(id).length_m for id in seam.refused if not seam.reason)
+    worth = round(length_m * min(thin or MOST_PLATE_M, MOST_PLATE_M), 7)  # m2
+    above = j.up_P[2] > OPEN_ABOVE
+    fits = bool(seam.reason), unlikely, not seam.felt, round(seam.short_m, 3)
+    return (*fits, not above, seam.short_m, -worth)
+
+
+def alike(seams: Sequence[Seam]) -> list[list[int]]:
+    """Return the numbers of the seams in groups of one type, length, angle, thickness and verdict, each as ranked."""
+    found = dict[tuple[Any, ...], list[int]]()
+    for k, seam in enumerate(seams):
+        j = seam.joint
+        sizes = round(1e3 * j.length_m), round(math.degrees(j.angle_rad)), round(1e4 * min(j.thick_m)), len(j.edges)
+        found.setdefault((j.type, *sizes, not seam.reason, seam.planned, bool(seam.offers)), []).append(k)
+    return list(found.values())
 
 
 def _creases(shape: PartShape) -> list[PartJoint]:
@@ -145,10 +180,10 @@ def _creases(shape: PartShape) -> list[PartJoint]:
     ]
 
 
-def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
-    """Say why a tool does not fit a joint, by how much (m), and whether the joint is felt.
+def _obstacles(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[dict[int, tuple[str, float]], bool]:
+    """Say why a tool does not fit edges of a joint, by how much (m), by edge; and whether the joint is felt.
 
-    Its ball is tried at the walls, its body at the middle of one of the edges.
+    Its ball is tried at the walls, its body at the middle of each edge.
     """
     flush = joint.angle_rad > math.pi - 0.01
     half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
@@ -160,24 +195,31 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             check_weldable(section, tool.tip_radius_m)
         if ring is not None:
             check_ring(shape.mesh, *ring, section, tool)
-        for id in joint.edges if ring is None else ():
-            edge = shape.edge(id)
-            assert edge.up_P is not None
-            k = max(1, len(edge.points_P) // 2)
-            along = edge.points_P[k] - edge.points_P[k - 1]
-            middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
-            tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
-            line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
+    except WeldcalError as error:
+        why = _why(error)
+        if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
+            why = why[0] + least_pipe(shape, joint, tool), why[1]
+        return dict.fromkeys(joint.edges, why), felt
+    found = dict[int, tuple[str, float]]()
+    for id in joint.edges if ring is None else ():
+        edge = shape.edge(id)
+        assert edge.up_P is not None
+        k = max(1, len(edge.points_P) // 2)
+        along = edge.points_P[k] - edge.points_P[k - 1]
+        middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
+        tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
+        line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
+        try:
             seam = SeamCurve.from_points(line, up=np.tile(edge.up_P, (5, 1)))
             check_clearance(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
-    except WeldcalError as error:
-        reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
-        if isinstance(error, NoClearance) and len(joint.edges) > 1:
-            reason = f"edge {id}: {reason}"
-        if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
-            reason += least_pipe(shape, joint, tool)
-        return reason, error.short_m if isinstance(error, NoClearance) else math.inf, felt
-    return "", 0.0, felt
+        except WeldcalError as error:
+            found[id] = _why(error)
+    return found, felt
+
+
+def _why(error: WeldcalError) -> tuple[str, float]:
+    reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
+    return reason, error.short_m if isinstance(error, NoClearance) else math.inf
 
 
 def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
@@ -200,7 +242,7 @@ def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""
-    far, across = max(joint.walls_m), 2.0 * float(np.linalg.norm(ring[0][0] - ring[0][:-1].mean(axis=0)))
+    far, across = round(max(joint.walls_m), 3), 2.0 * float(np.linalg.norm(ring[0][0] - ring[0][:-1].mean(axis=0)))
     words = f" The least pipe for this tool is {1e3 * least_pipe_m(tool, far):.0f} mm across."
     other = load_tool(tool_file(Path(PIPE_TOOL))).tool
     if tool.chord_m <= other.chord_m or across < least_pipe_m(other, far):

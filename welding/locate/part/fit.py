@@ -41,6 +41,7 @@ SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
 FINE_GATE_M, FINE_GATE = 0.008, 1.0 / 40.0  # first gate, at least, and in the part's radius: a cell of the search
 CLUSTERS = 100_000  # numbers reserved for the clusters of each scan: more than its points on rims
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
+NEAR_CELLS = 128  # along the longest side, in which points near an edge are found: a choice, two million at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,11 +198,23 @@ def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.i
 
 
 def _beside(p: Floats, edges: SharpEdges, reach: float) -> Mask:
-    """Which points (N,3) in P lie near an edge."""
+    """Which points (N,3) in P lie near an edge: in the cells around those of the edges, which hold all within reach."""
     if not len(edges.point):
         return np.zeros(len(p), dtype=bool)
-    away = cKDTree(edges.point).query(p, distance_upper_bound=reach + 0.002)[0]
-    return np.asarray(np.isfinite(away))
+    low, high = edges.point.min(axis=0), edges.point.max(axis=0)
+    cell = max(reach + 0.002, float((high - low).max()) / NEAR_CELLS)
+    size = ((high - low) / cell).astype(np.int64) + 3  # with a border of one cell
+    near = np.zeros(size, dtype=bool)
+    near[tuple((((edges.point - low) / cell).astype(np.int64) + 1).T)] = True
+    for axis in range(3):
+        ahead = np.moveaxis(near, axis, 0)
+        before = ahead.copy()
+        ahead[1:] |= before[:-1]
+        ahead[:-1] |= before[1:]
+    at = np.floor((p - low) / cell).astype(np.int64) + 1
+    inside = ((at >= 0) & (at < size)).all(axis=1)
+    inside[inside] = near[tuple(at[inside].T)]
+    return np.asarray(inside)
 
 
 def tukey(r: Floats, c: float) -> Floats:
