@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import resource
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -102,7 +103,8 @@ def _bounded(path: Path, units: str | None) -> PartShape:
     with TemporaryDirectory() as folder:
         result = Path(folder) / "shape"
         code = f"from weldcal.models.workpieces.reading import send; send({str(path)!r}, {units!r}, {str(result)!r})"
-        subprocess.run([sys.executable, "-c", code], check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        quiet = subprocess.DEVNULL
+        ended = subprocess.run([sys.executable, "-c", code], check=False, stdout=quiet, stderr=quiet).returncode
         found = pickle.loads(result.read_bytes()) if result.is_file() else None
     if isinstance(found, InputError):
         raise found
@@ -110,9 +112,11 @@ def _bounded(path: Path, units: str | None) -> PartShape:
         lighter = "without threads, holes and purchased parts"
         if path.suffix.lower() in MESH_SUFFIXES:
             lighter = f"as a STEP file or with fewer triangles, {lighter}"
+        late = ended in (-signal.SIGXCPU, -signal.SIGKILL)
+        why = f"cannot be read within {MOST_S} s of processor time" if late else "makes its reader crash"
         raise InputError(
-            f"'{path.name}' cannot be read within {MOST_S} s of processor time: it has too many faces, or damaged "
-            f"ones. Export only the bodies that are welded, {lighter}."
+            f"'{path.name}' {why}: it has too many faces, or damaged ones. Export only the bodies that are welded,"
+            f" {lighter}."
         )
     return found
 

@@ -15,7 +15,7 @@ from tests.places import ROOT
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
     "code lines of calibration": 28_719,
-    "code lines of models": 6_055,
+    "code lines of models": 6_059,
     "code lines of systems": 19_177,
     "code lines of tools": 23_616,
     "code lines of welding": 9_561,

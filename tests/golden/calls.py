@@ -64,11 +64,11 @@ RECORDED = {
 """What needs no live run, by name."""
 
 LIVE = {
-    "demo": "demo s_groove",
-    "weld_straight": "weld straight_groove",
-    "weld_corner": "weld l_groove",
-    "weld_bent": "weld curved_s_groove",
-    "demo_carried": "demo carried_scanner",
+    "demo": "demo s_groove --no-browser",
+    "weld_straight": "weld straight_groove --no-browser",
+    "weld_corner": "weld l_groove --no-browser",
+    "weld_bent": "weld curved_s_groove --no-browser",
+    "demo_carried": "demo carried_scanner --no-browser",
     "live_bare_flange": "calibrate --scenario calibrate_only",
     "live_motion": "calibrate --scenario motion",
     "live_eye_on_base": "hand-eye live eye_on_base",

@@ -13,8 +13,7 @@ from pathlib import Path
 from tests.golden.calls import CALLS, LIVE, filled, make_inputs, named
 from tests.golden.compare import RESULTS, Figures, differences, figures, rounded
 
-# --no-browser where a command would open a page; the seed is not 0, so that it is seen to arrive.
-_LIVE_OPTIONS = ("--no-browser", "--seed", "1")
+_LIVE_OPTIONS = ("--seed", "1")  # not 0, so that it is seen to arrive
 _LONGEST_S = 900.0
 _WITHOUT_OUT = ("robots", "doctor")
 

@@ -416,7 +416,7 @@ def test_a_large_file_is_read_in_a_process_of_its_own(
         monkeypatch.setattr(reading.sys, "executable", "/bin/false")
     reading._read.cache_clear()
     if damage:
-        with pytest.raises(InputError, match=r"'t.step' cannot be read within 45 s of processor time"):
+        with pytest.raises(InputError, match=r"'t.step' makes its reader crash: .* Export only the bodies"):
             read_shape(tmp_path / "t.step")
         return
     found = read_shape(tmp_path / "t.step")
