@@ -17,22 +17,23 @@ Mask = npt.NDArray[np.bool_]
 class DepthNoise:
     """How a scanner errs along its optical axis; metres, radians, pixels. All zero is a perfect scanner.
 
-    sigma_m            standard deviation of the noise on a bright surface seen head-on at `reference_m`
-    growth             the noise grows as (depth / reference)^growth: 2 for triangulation and for time of flight
-    incidence          the noise grows as (1 / cos of the angle of incidence)^incidence
-    correlation_px     the noise is smoothed with a Gaussian of this width and keeps its sigma (0: white)
-    edge_step_m        neighbouring depths further apart than this are a depth discontinuity
-    flying             chance that a pixel beside a discontinuity reads something between the two depths
-    edge_dropout       chance that a pixel beside a discontinuity reads nothing
-    grazing_rad        surfaces seen at a larger angle of incidence are not measured
-    dropout            chance that any pixel reads nothing
-    dark_dropout       chance that a fully dark pixel (dark = 1) reads nothing
-    dark_gain          the noise of a fully dark pixel is (1 + dark_gain) times that of a bright one
-    quantum_m          depths come in steps of this size (0: continuous)
-    warp_m, device     largest value of a smooth error over the image that stays the same for one device (a seed), at
-                       the reference depth; it grows with depth like the noise
-    scale_error        relative error of every depth, and with it of every point, in a calibrated device
-    gradient_per_m     further relative error per metre of x and of y (true, camera frame)
+    Attributes:
+        sigma_m: standard deviation of the noise on a bright surface seen head-on at `reference_m`.
+        growth: the noise grows as (depth / reference)^growth: 2 for triangulation and for time of flight.
+        incidence: the noise grows as (1 / cos of the angle of incidence)^incidence.
+        correlation_px: the noise is smoothed with a Gaussian of this width and keeps its sigma (0: white).
+        edge_step_m: neighbouring depths further apart than this are a depth discontinuity.
+        flying: chance that a pixel beside a discontinuity reads something between the two depths.
+        edge_dropout: chance that a pixel beside a discontinuity reads nothing.
+        grazing_rad: surfaces seen at a larger angle of incidence are not measured.
+        dropout: chance that any pixel reads nothing.
+        dark_dropout: chance that a fully dark pixel (dark = 1) reads nothing.
+        dark_gain: the noise of a fully dark pixel is (1 + dark_gain) times that of a bright one.
+        quantum_m: depths come in steps of this size (0: continuous).
+        warp_m, device: largest value of a smooth error over the image that stays the same for one device (a seed), at
+            the reference depth; it grows with depth like the noise.
+        scale_error: relative error of every depth, and with it of every point, in a calibrated device.
+        gradient_per_m: further relative error per metre of x and of y (true, camera frame).
     """
 
     sigma_m: float = 0.0
@@ -83,7 +84,8 @@ def noisy_depth(
 ) -> Depth:
     """A copy of a perfect depth map (H,W) in metres as the scanner would return it; 0 stays and marks "no reading".
 
-    fx..cy are in pixels, OpenCV convention (centre of the first pixel at 0, 0). `dark` (H,W) runs from 0 (bright) to 1.
+    ``fx..cy`` are in pixels, OpenCV convention (centre of the first pixel at 0, 0). `dark` (H,W) runs from 0 (bright)
+    to 1.
     """
     perfect = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0)).astype(np.float32, copy=False)
     valid = perfect > 0.0

@@ -20,7 +20,8 @@ Floats = NDArray[np.float64]
 class ProfilerPreset:
     """What a profiler sees: samples over a width, between two distances, with its errors (all m; shares of samples).
 
-    quantum_m rounds z; share_missing and share_spikes of the samples are lost, or off by up to spike_m.
+    Attributes:
+        quantum_m: rounds z; share_missing and share_spikes of the samples are lost, or off by up to spike_m.
     """
 
     samples: int = 300

@@ -52,17 +52,18 @@ def _edge_pixels(samples: Depth, flying: float, rng: np.random.Generator) -> Dep
 class ScannerStream:
     """Timing of streamed frames; seconds. A frame is captured in the middle of the exposure of its middle row.
 
-    fps                  frames per second of the device's clock
-    exposure_s           time over which each row is exposed
-    readout_s            time between the exposures of the first and the last row; 0: a global shutter
-    period_jitter_s      standard deviation of a capture about its regular time
-    delay_s              mean time from capture to arrival
-    delay_jitter_s       its standard deviation: a smallest delay and a skewed tail (a gamma distribution of shape 2)
-    device_epoch_s       reading of the device's clock at robot time 0
-    device_drift_ppm     rate of the device's clock over the robot's, less 1, in parts per million
-    device_jitter_s      standard deviation of a stamp about its capture
-    device_quantum_s     step of the device's stamps
-    loss                 chance that a frame never arrives
+    Attributes:
+        fps: frames per second of the device's clock.
+        exposure_s: time over which each row is exposed.
+        readout_s: time between the exposures of the first and the last row; 0: a global shutter.
+        period_jitter_s: standard deviation of a capture about its regular time.
+        delay_s: mean time from capture to arrival.
+        delay_jitter_s: its standard deviation: a smallest delay and a skewed tail (a gamma distribution of shape 2).
+        device_epoch_s: reading of the device's clock at robot time 0.
+        device_drift_ppm: rate of the device's clock over the robot's, less 1, in parts per million.
+        device_jitter_s: standard deviation of a stamp about its capture.
+        device_quantum_s: step of the device's stamps.
+        loss: chance that a frame never arrives.
     """
 
     fps: float = 20.0

@@ -475,7 +475,7 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
 def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str], ...]:
     """Scans identical to another one, with the reason.
 
-    a copy would count twice and predict itself in cross-validation.
+    A copy would count twice and predict itself in cross-validation.
     """
     first: dict[tuple[object, ...], str] = {}
     again = []

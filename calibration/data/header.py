@@ -44,7 +44,7 @@ class ScannerGuess:
 class SecondRobot:
     """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base.
 
-    m, quaternion wxyz.
+    Lengths in m, quaternion wxyz.
     """
 
     robot: str = "ur10e"

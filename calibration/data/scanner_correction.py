@@ -29,7 +29,7 @@ _USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so m
 class ScannerCorrection:
     """Correct a point by p_C (scale + gx x + gy y + bends).
 
-    x and y (m) are those of the point as it was measured, in the camera frame.
+    ``x`` and y (m) are those of the point as it was measured, in the camera frame.
 
     ``gradient_per_m`` is (gx, gy) in 1/m. ``bend`` is empty, or the factors of x^2, x y, y^2 (1/m^2), or those and of
     x^3, x^2 y, x y^2, y^3 (1/m^3): what a lens that is not quite known does. Bends hold within ``field_m`` (smallest

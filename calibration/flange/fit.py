@@ -401,7 +401,7 @@ def _reduced(basis: Array) -> Array:
 def _indices(ray: Array, basis: Array) -> NDArray[np.intp] | None:
     """Pixel (N, 2) of each ray (N, 2) about the middle.
 
-    a plane's lattice, or one that grows from the middle and bends.
+    A plane's lattice, or one that grows from the middle and bends.
     """
     at = ray @ np.linalg.inv(basis)
     order = np.argsort((at * at).sum(axis=1), kind="stable")
@@ -445,8 +445,8 @@ def is_thinned(grid: Array) -> bool:
 def interpolated(grid: Array) -> Array:
     """Return a thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
 
-    x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one goes on.
-    Gaps longer than twice the common one stay.
+    The values x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one
+    goes on. Gaps longer than twice the common one stay.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / grid[..., 2]

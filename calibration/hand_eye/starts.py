@@ -95,8 +95,8 @@ def dual_quaternions(problem: Problem, state: State) -> Rotations:
 def kronecker_three(problem: Problem, state: State) -> Rotations:
     """R_F R_X R_G = R_Y R_H R_Z, linear in R_X and in the product of R_Y and R_Z: 90 unknowns, one null vector.
 
-    vec(R_F R_X R_G) = (R_F (x) R_G^T) vec(R_X) and vec(R_Y R_H R_Z) = (R_Y (x) R_Z^T) vec(R_H): the 81 entries of the
-    latter factor are one vector, split afterwards into its nearest Kronecker product (Van Loan and Pitsianis 1993).
+    Here vec(R_F R_X R_G) = (R_F (x) R_G^T) vec(R_X) and vec(R_Y R_H R_Z) = (R_Y (x) R_Z^T) vec(R_H): the 81 entries of
+    the latter factor are one vector, split afterwards into its nearest Kronecker product (Van Loan and Pitsianis 1993).
     """
     F, G, H = problem.F[:, :3, :3], problem.G[:, :3, :3], problem.H[:, :3, :3]
     n = len(F)

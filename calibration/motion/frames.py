@@ -1,6 +1,6 @@
 """Fits the flange in every frame of a recording.
 
-a search in some frames, then near where the robot's stream says it is.
+A search in some frames, then near where the robot's stream says it is.
 """
 
 from collections import Counter

@@ -22,7 +22,7 @@ ARM_ERRORS = len(OFFSET_JOINTS) + len(SAG_JOINTS) + 6 * len(TABLE)
 class ProfilerArmErrors:
     """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3).
 
-    a m, alpha rad, d m.
+    ``a`` in m, ``alpha`` in rad, ``d`` in m.
     """
 
     offsets: Floats

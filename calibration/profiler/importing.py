@@ -1,6 +1,6 @@
 """Import profiles with flange poses.
 
-a table, an export with poses in a file beside it, or a folder with one file per profile.
+A table, an export with poses in a file beside it, or a folder with one file per profile.
 """
 
 import re

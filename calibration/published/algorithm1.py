@@ -325,7 +325,7 @@ def translation_cost(error: Array) -> float:
 def translation_and_rotation_cost(work_radius_m: float) -> Cost:
     """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m.
 
-    a bound on the error there, where the paper's is a norm of all six.
+    A bound on the error there, where the paper's is a norm of all six.
     """
 
     def cost(error: Array) -> float:

@@ -294,7 +294,7 @@ def with_kinematics(
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
     """Return the arm's link transforms with the errors found, as a file of Universal Robots' schema.
 
-    m, rad; load_arm reads it.
+    Units are m and rad; load_arm reads it.
     """
     links = {}
     for link, moved in zip(LINKS, fit.corrected_stack(), strict=True):

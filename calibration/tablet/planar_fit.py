@@ -34,10 +34,10 @@ class ClosedForm:
 class LinearFit:
     """Six-parameter calibration: hand = [a x - b y + t_x + x_p C - y_p S, -b x - a y + t_y - x_p S - y_p C].
 
-    x, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p, all m.
-    ``covariance`` (6, 6) m^2 from the residuals. ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted minus
-    measured, the second by a fit that never saw that landmark. ``scale``: fitted over measured depth (1 for a perfect
-    depth camera). ``condition``: of the column-scaled design.
+    ``x``, y are viewing rays at depth 1, C and S of the hand's turn. ``parameters`` (6,) = a, b, t_x, t_y, x_p, y_p,
+    all m. ``covariance`` (6, 6) m^2 from the residuals. ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted
+    minus measured, the second by a fit that never saw that landmark. ``scale``: fitted over measured depth (1 for a
+    perfect depth camera). ``condition``: of the column-scaled design.
     """
 
     parameters: Array
@@ -146,8 +146,8 @@ def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArr
 class PlanarFit:
     """Calibration by the tablet's own size: hand = scale M(phi) p + t + pen(theta), M = [[c, s], [s, -c]].
 
-    p: point of the tablet (m) that a pixel shows by ``X_CT``. ``parameters`` (6,) = phi (rad), t_x, t_y, x_p, y_p (m),
-    scale (1 unless it was freed). ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale.
+    ``p``: point of the tablet (m) that a pixel shows by ``X_CT``. ``parameters`` (6,) = phi (rad), t_x, t_y, x_p, y_p
+    (m), scale (1 unless it was freed). ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale.
     ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted from the image minus measured, the second by a fit
     that saw that landmark neither touched nor in the image. ``free_scale``: (value, standard deviation) of a scale that
     the touches alone would like, a check of the tablet's pixels per inch.

@@ -175,7 +175,7 @@ def stage2_residuals(touches: TabletTouches, affine: Array, stage1: Landmarks, s
 def apply_affine(a: Array, points: Array, about: Array | None = None) -> Array:
     """Apply Eq. 24 to points (k, n, 2) mm, about a point (k, 2) or landmark 4.
 
-    a (k, 5) is X, Y, Sx, Sy (1), theta (deg).
+    ``a`` (k, 5) is X, Y, Sx, Sy (1), theta (deg).
     """
     X, Y, Sx, Sy, theta = np.asarray(a).T[:, :, None]
     centre = points[:, CENTRE : CENTRE + 1] if about is None else np.asarray(about)[:, None, :]

@@ -70,8 +70,8 @@ class Housings:
 class ArmModel:
     """One arm. Arrays are read-only; joint order is `joint_names`, link order is `link_names` (link 0 is the base).
 
-    stack is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are (6,)
-    in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
+    ``stack`` is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are
+    (6,) in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
     centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
     tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the
     radii of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or

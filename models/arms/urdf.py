@@ -38,7 +38,7 @@ _SEGMENTS = 192
 class Capsule:
     """All points within `radius` (m) of the segment p_start to p_end (3,) m, in a link's frame.
 
-    link_index counts as `link_frames` and `link_names` do: 0 the base, 6 wrist 3. A sphere has p_start = p_end.
+    ``link_index`` counts as `link_frames` and `link_names` do: 0 the base, 6 wrist 3. A sphere has p_start = p_end.
     """
 
     link_index: int

@@ -319,7 +319,7 @@ def _check_sizes(file: str, part: ToolPart) -> None:
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
     """Compute R_FT, and the torch point (-chord, 0, height) in T, m.
 
-    z_T points against the finger's axis, x_T from the torch to the tip.
+    ``z_T`` points against the finger's axis, x_T from the torch to the tip.
     """
     z = -_unit(part.tip.axis)
     to_tip = (np.array(part.tip.xyz_mm) - np.array(part.torch.xyz_mm)) / 1e3

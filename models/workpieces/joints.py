@@ -54,16 +54,17 @@ NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 class Piece:
     """A stretch of a joint where one face of a body meets one of another.
 
-    line    (N,3) mm; a closed one repeats its first point
-    up      (3,) unit, in the middle of the line, out of the joint
-    type    T, lap, corner, V, HV, butt or edge
-    angle   rad, through the free space
-    gap     mm, between the bodies
-    bodies  numbers of the two bodies
-    side    inside or outside of a corner, left or right of a web; else ""
-    walls   mm, extent of the two walls from the root; of flush faces the depth of the joint
-    thick   mm, of the two bodies under their walls, beside the root
-    pipe    the type of a ring of such pieces: pipe on plate, pipe on pipe or flange on pipe; else ""
+    Attributes:
+        line: (N,3) mm; a closed one repeats its first point.
+        up: (3,) unit, in the middle of the line, out of the joint.
+        type: T, lap, corner, V, HV, butt or edge.
+        angle: rad, through the free space.
+        gap: mm, between the bodies.
+        bodies: numbers of the two bodies.
+        side: inside or outside of a corner, left or right of a web; else "".
+        walls: mm, extent of the two walls from the root; of flush faces the depth of the joint.
+        thick: mm, of the two bodies under their walls, beside the root.
+        pipe: the type of a ring of such pieces: pipe on plate, pipe on pipe or flange on pipe; else "".
     """
 
     line: Floats

@@ -126,8 +126,8 @@ BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands 
 class WeldPart(Protocol):
     """What a weld needs to know of a workpiece in its frame P, m: a grooved plate or a part from a file.
 
-    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or
-    (1,3) the bisector of its walls, depth_m from their upper end to the root.
+    ``mesh`` is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3)
+    or (1,3) the bisector of its walls, depth_m from their upper end to the root.
     """
 
     @property

@@ -85,12 +85,14 @@ class PlanarPath:
 class Workpiece:
     """A grooved plate in frame P, metres and radians.
 
-    mesh         closed surface of the whole plate (for rendering, registration and the eye)
-    groove_mesh  closed solid of the groove walls and a narrow band of the top face (for rigid hydroelastic contact)
-    seam_P       (N,3) the groove's root line from edge to edge, evenly spaced; tangents_P (N,3); arc_length_m (N,)
-    outline_P    (4,2) corners of the top face, counter-clockwise; size_m (x, y, z) of the uncut plate
-    X_PG         where the groove lies relative to its drawing; identity on the drawing itself
-    up_P         (N,3) or (1,3) the surface's normal along the seam; bend_radius_m of a plate bent over a cylinder
+    Attributes:
+        mesh: closed surface of the whole plate (for rendering, registration and the eye).
+        groove_mesh: closed solid of the groove walls and a narrow band of the top face (for rigid hydroelastic
+            contact).
+        seam_P: (N,3) the groove's root line from edge to edge, evenly spaced; tangents_P (N,3); arc_length_m (N,).
+        outline_P: (4,2) corners of the top face, counter-clockwise; size_m (x, y, z) of the uncut plate.
+        X_PG: where the groove lies relative to its drawing; identity on the drawing itself.
+        up_P: (N,3) or (1,3) the surface's normal along the seam; bend_radius_m of a plate bent over a cylinder.
     """
 
     name: str

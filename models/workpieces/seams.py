@@ -21,14 +21,18 @@ SPACING_M = 0.0005
 class DrawnSeam:
     """A seam in frame P (or another, see `transformed`), metres and unit vectors; N >= 4 points in the order of travel.
 
-    points_P      (N,3) the root line, evenly spaced (0.5 mm): where the two walls meet; of a butt joint with a gap the
-                  middle of the gap, level with the plates' faces
-    up_P          (N,3) the bisector of the walls, out of the joint towards the tool wall_left_P   (N,3) outward normal
-    of the wall on the left of the travel direction; wall_right_P of the one on the right.
-                  Of a butt joint with a gap both are the normal of the plates' faces
-    joint         v_groove, butt, fillet or lap wall_height_m (left, right) usable extent of each wall, from the root
-    line; of a butt joint with a gap the gap's depth gap_m         width of the gap of a butt joint, else 0 closed
-    the last point continues into the first feel          whether the tip feels it; None: where a ball can
+    Attributes:
+        points_P: (N,3) the root line, evenly spaced (0.5 mm): where the two walls meet; of a butt joint with a gap the
+            middle of the gap, level with the plates' faces.
+        up_P: (N,3) the bisector of the walls, out of the joint towards the tool.
+        wall_left_P, wall_right_P: (N,3) outward normals of the walls on the left and on the right of the travel
+            direction; of a butt joint with a gap the normal of the plates' faces.
+        joint: v_groove, butt, fillet or lap.
+        wall_height_m: (left, right) usable extent of each wall, from the root line; of a butt joint with a gap the
+            gap's depth.
+        gap_m: width of the gap of a butt joint, else 0.
+        closed: the last point continues into the first.
+        feel: whether the tip feels it; None: where a ball can.
     """
 
     points_P: Floats

@@ -72,9 +72,10 @@ class JointNotWeldable(InputError):
 class JointSection:
     """The joint's walls in the cut: one face on each side that leaves the root line.
 
-    half_angle_rad  between each wall and the bisector; pi/2 of level plates
-    left_m, right_m extent of the walls from the root
-    gap_m           of level plates, between their edges
+    Attributes:
+        half_angle_rad: between each wall and the bisector; pi/2 of level plates.
+        left_m, right_m: extent of the walls from the root.
+        gap_m: of level plates, between their edges.
     """
 
     half_angle_rad: float

@@ -19,14 +19,15 @@ UNITS_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 class PartEdge:
     """An edge of a part in its frame P.
 
-    id        the number by which a scenario names it, from 1 kind      concave: the free space between the faces is
-    less than pi; flush: the faces of two bodies lie in one plane;
-              convex; smooth: the faces are tangent; boundary: only one face ends here
-    points_P  (N,3) m, N >= 2, along the edge; a closed edge repeats its first point
-    angle_rad between the two faces: through the free space of a concave edge, through the material of a convex one;
-              pi of a smooth edge, nan of a boundary
-    radius_m  of a circular edge; None of any other
-    up_P      (3,) unit, out of the joint at the middle of the edge, where it belongs to one
+    Attributes:
+        id: the number by which a scenario names it, from 1.
+        kind: concave: the free space between the faces is less than pi; flush: the faces of two bodies lie in one
+            plane; convex; smooth: the faces are tangent; boundary: only one face ends here.
+        points_P: (N,3) m, N >= 2, along the edge; a closed edge repeats its first point.
+        angle_rad: between the two faces: through the free space of a concave edge, through the material of a convex
+            one; pi of a smooth edge, nan of a boundary.
+        radius_m: of a circular edge; None of any other.
+        up_P: (3,) unit, out of the joint at the middle of the edge, where it belongs to one.
     """
 
     id: int
@@ -51,17 +52,18 @@ class PartEdge:
 class PartJoint:
     """A place at which a part can be welded: one seam along edges that follow each other.
 
-    type      T, lap, corner, V, HV, butt, edge, pipe on plate, pipe on pipe or flange on pipe
-    edges     their numbers in the order of travel
-    length_m  along all of them
-    angle_rad through the free space; pi where the faces are flush
-    gap_m     largest gap between the bodies
-    walls_m   extent of the two walls from the root; of flush faces their depth
-    thick_m   of the two bodies at the root, under these walls
-    up_P      (3,) unit, out of the joint, in the middle of its longest edge
-    side      left or right of a web, inside or outside of a corner; else ""
-    closed    it ends where it begins
-    bodies    names of the two bodies in the file, as far as it has them
+    Attributes:
+        type: T, lap, corner, V, HV, butt, edge, pipe on plate, pipe on pipe or flange on pipe.
+        edges: their numbers in the order of travel.
+        length_m: along all of them.
+        angle_rad: through the free space; pi where the faces are flush.
+        gap_m: largest gap between the bodies.
+        walls_m: extent of the two walls from the root; of flush faces their depth.
+        thick_m: of the two bodies at the root, under these walls.
+        up_P: (3,) unit, out of the joint, in the middle of its longest edge.
+        side: left or right of a web, inside or outside of a corner; else "".
+        closed: it ends where it begins.
+        bodies: names of the two bodies in the file, as far as it has them.
     """
 
     type: str

@@ -363,7 +363,7 @@ def with_joints(
 ) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
     """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints.
 
-    names: of the bodies.
+    ``names``: of the bodies.
     """
     from weldcal.models.workpieces.brep import length_of
     from weldcal.models.workpieces.joints import closes

@@ -44,7 +44,7 @@ class Left:
 class Recording:
     """A recording in memory.
 
-    about: versions, seed and what else the file says of the run; files: by name. entered: what the station's ports
+    ``about``: versions, seed and what else the file says of the run; files: by name. entered: what the station's ports
     showed. left: messages by the name of the port or result, in order. rows: number in the file, key and values of all
     vector ports of a side. answers: looks by the number of the question. end: what is said of the end of the run; None
     where the file was cut off. last_key: of the newest message.

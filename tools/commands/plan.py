@@ -61,9 +61,9 @@ def plan_refining_poses(
 ) -> dict[str, object]:
     """Choose ``scans`` poses before a scenario's scanner; write poses.csv, poses.script and plan.json to ``out``.
 
-    poses.csv is the table of a dataset with the joint angles as planned; replace them by those that the robot reports
-    at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in
-    which no such poses exist.
+    ``poses.csv`` is the table of a dataset with the joint angles as planned; replace them by those that the robot
+    reports at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a
+    cell in which no such poses exist.
     """
     if kind not in KINDS:
         raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")

@@ -365,7 +365,7 @@ def weld_traces(weld: WeldOutcome, cell: Cell[WeldJob], root: Context) -> dict[s
 def weld_trace(weld: WeldOutcome, config: ServoConfig, place: Array, off: Sequence[Sequence[PathError]]) -> WeldTrace:
     """Return the weld for the pictures where it has a place (N,) m along the seam; `off`: errors of plan and torch.
 
-    y of the base is drawn to the right, as in the cell.
+    ``y`` of the base is drawn to the right, as in the cell.
     """
     log, named = weld.log, weld.log.telemetry
     keep = np.isfinite(place) & (named["phase"] != list(Phase).index(Phase.TOUCH))  # the search has no place

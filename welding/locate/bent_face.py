@@ -25,8 +25,9 @@ BAND_M = 0.003  # about a flat or bent face: above a scanner's noise and form er
 class BentFace:
     """A cylindrical face: frame Q is tangent to it at its origin, x around it, y along its axis, z out of the face; m.
 
-    radius_m is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates (arc
-    length around, along, height over the face). reach_m: how far from the origin the face was seen, around and along.
+    ``radius_m`` is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates
+    (arc length around, along, height over the face). reach_m: how far from the origin the face was seen, around and
+    along.
     """
 
     X_AQ: RigidTransform

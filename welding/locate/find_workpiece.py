@@ -56,10 +56,11 @@ class AmbiguousWorkpiece(WorkpieceNotFound):
 class FoundWorkpiece:
     """The pose of the part found, and its confidence.
 
-    registration  the fine registration at the place found
-    groove        agreement of the groove seen with the one drawn here, -1 to 1; None where it could not be seen
-    confidence    0 to 1: supported less contradicted share of the outline, reduced by the runner-up
-    summary       the result in one sentence
+    Attributes:
+        registration: the fine registration at the place found.
+        groove: agreement of the groove seen with the one drawn here, -1 to 1; None where it could not be seen.
+        confidence: 0 to 1: supported less contradicted share of the outline, reduced by the runner-up.
+        summary: the result in one sentence.
     """
 
     registration: WorkpieceRegistration
@@ -82,7 +83,7 @@ def find_workpiece(
 ) -> FoundWorkpiece:
     """Find the plate in a scan (N,3) or (H,W,3), metres in base with z up, at any position and turn about z.
 
-    turn_hint_rad: the part's turn about z to within 90 deg, for parts that look the same after half a turn.
+    ``turn_hint_rad``: the part's turn about z to within 90 deg, for parts that look the same after half a turn.
     eye_B (3,): the scanner's position, for the covariance.
 
     Raises:

@@ -78,7 +78,7 @@ def by_the_edge(p: Floats, outline: Floats, reach: float = 0.020) -> npt.NDArray
 def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple[Floats, npt.NDArray[np.int64]]:
     """The face point nearest the outside in every strip across each edge: its row (M,k) and the edges' numbers (M,).
 
-    face (N,k): x and y first, then any other columns.
+    ``face`` (N,k): x and y first, then any other columns.
     """
     found, numbers = [], []
     for k, (a, b, inward) in enumerate(

@@ -141,7 +141,7 @@ def point_pitch(xy: Floats) -> float:
 def thinned(points: Floats, most: int, least_cell_m: float = 0.0) -> Floats:
     """Thin points (N,3), z up, to about `most`: one unchanged point in every cell of a square grid seen from above.
 
-    least_cell_m: cells are at least this large, so that fewer may be left. A cloud with fewer points is returned
+    ``least_cell_m``: cells are at least this large, so that fewer may be left. A cloud with fewer points is returned
     unchanged.
     """
     if len(points) <= most and least_cell_m == 0.0:

@@ -38,10 +38,11 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 class PlanningMethod:
     """Method and search of the seam plan.
 
-    method   cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing search   of a
-    plate's drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns apart); a part
-             from a file is always searched anywhere
-    start_B  (x, y, z) m: a cloud's seam starts at its end nearest to this; without it nearest to the robot's base
+    Attributes:
+        method: cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing.
+        search: of a plate's drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns
+            apart). A part from a file is always searched anywhere.
+        start_B: (x, y, z) m: a cloud's seam starts at its end nearest to this; without it nearest to the robot's base.
     """
 
     method: str = "cad"
@@ -59,12 +60,18 @@ class PlanningMethod:
 class RootPlan:
     """The planned root of the groove in base, in the direction of travel.
 
-    root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane X_BP
-    where the drawing lies, where one was used sigma_m       of the root sideways, rms along it: with a drawing that of
-    the drawn groove, from which the real one may differ across_m      (N,) of a part: that of the drawn root sideways,
-    by the scan where it shows the root, else by the registration fit_up        of a part: how the two sides of the
-    joint stand to each other rms_m         of the face's points about their plane; confidence 0 to 1; summary: what was
-    found, in a sentence
+    Attributes:
+        root, up: (N,3) m and unit normals of the face.
+        half_angle_rad: between a wall and the groove's middle plane.
+        X_BP: where the drawing lies, where one was used.
+        sigma_m: of the root sideways, rms along it: with a drawing that of the drawn groove, from which the real one
+            may differ.
+        across_m: (N,) of a part: that of the drawn root sideways, by the scan where it shows the root, else by the
+            registration.
+        fit_up: of a part: how the two sides of the joint stand to each other.
+        rms_m: of the face's points about their plane.
+        confidence: 0 to 1.
+        summary: what was found, in a sentence.
     """
 
     root: Floats

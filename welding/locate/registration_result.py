@@ -41,13 +41,15 @@ class RegistrationConfig:
 class WorkpieceRegistration:
     """The pose X_BP of the plate (frame P of models.workpieces.plate), and how well the scan agrees with it.
 
-    rms_m             rms distance of the face's points from its plane, m
-    supported, contradicted   shares of the outline where the scan confirms, or contradicts, that the face ends there
-    confidence        supported less contradicted, 0 to 1
-    n_points          points on the face
-    covariance        (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation then translation
-    seam_sigma_m      lateral sigma of the drawn seam from that covariance, rms over the seam, in the face, m.
-                      The displacement of the real groove against the outline is not included.
+    Attributes:
+        rms_m: rms distance of the face's points from its plane, m.
+        supported, contradicted: shares of the outline where the scan confirms, or contradicts, that the face ends
+            there.
+        confidence: supported less contradicted, 0 to 1.
+        n_points: points on the face.
+        covariance: (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation then translation.
+        seam_sigma_m: lateral sigma of the drawn seam from that covariance, rms over the seam, in the face, m. The
+            displacement of the real groove against the outline is not included.
     """
 
     X_BP: RigidTransform

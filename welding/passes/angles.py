@@ -95,7 +95,7 @@ def leaned(press: Press, roll_rad: float, ratio: float) -> Press:
 def held(plan: SeamCurve, config: ServoConfig, travel_axial_m: float | None = None) -> Held:
     """Solve for the tool along a planned line of the tip with the wire's point and axis as ordered.
 
-    travel_axial_m: the travel angle is that of this press instead of the ordered one.
+    ``travel_axial_m``: the travel angle is that of this press instead of the ordered one.
     """
     order, tool, tilt, usual = config.angles, config.tool, config.windows.tilt_rad, config.deflection
     assert order is not None
@@ -282,7 +282,7 @@ def check_angles(plan: SeamCurve, found: Held, config: ServoConfig) -> None:
 def _refusal(found: Held, ends: list[Held], config: ServoConfig, limits: tuple[float, float], k: int) -> str:
     """The sentences of a tip that would leave its limits (low, high) m of the press, worst at the place k.
 
-    ends: the tool as it is held by the least and the largest press.
+    ``ends``: the tool as it is held by the least and the largest press.
     """
     order = config.angles
     assert order is not None

@@ -331,7 +331,7 @@ def _listing(
 def _without_pose(meanings: Sequence[tuple[Array, Array]]) -> list[tuple[int, str]]:
     """Rows that hold no pose.
 
-    a number is missing, the rotation is zero, or both are those of no motion (a failed detection).
+    A number is missing, the rotation is zero, or both are those of no motion (a failed detection).
     """
     p, r = meanings[0]
     flat = np.concatenate([p, r.reshape(len(r), -1)], axis=1)

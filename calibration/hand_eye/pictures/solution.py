@@ -430,7 +430,7 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
     """Return the pairs with, for each picture, the solution that lies nearest to what the result predicts.
 
-    a plane and a symmetric board have several.
+    A plane and a symmetric board have several.
     """
     assert pairs.img is not None
     assert pairs.K is not None

@@ -74,7 +74,7 @@ class Rows:
 def tracked_rows(X_BC: RigidTransform, pivot: Array, frames: Sequence[TrackedFrame]) -> Rows:
     """Residuals of frames (n) against a calibration.
 
-    e = X_BC p_C - p_BR, and the tilt of R_BC n_C against the robot's normal.
+    ``e`` = X_BC p_C - p_BR, and the tilt of R_BC n_C against the robot's normal.
 
     A scanner that moved by (a, b) about the pivot, X_BC' = Exp(a, b) X_BC, sees the flange where the old pose puts it
     at e = - a x (q - pivot) - b. A pose that is taken d seconds too early leaves e = v d; a scanner that measures all

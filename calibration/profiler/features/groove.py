@@ -39,7 +39,7 @@ class GrooveFeatures:
 def groove_features(profile: ArrayLike) -> GrooveFeatures:
     """Find the features of a V-groove in a profile (n, 2) [x, z] m.
 
-    z grows away from the sensor; NaN where nothing returned.
+    ``z`` grows away from the sensor; NaN where nothing returned.
 
     Raises:
         FeatureNotFound: no V-groove with both walls and the plate on both sides. InputError: not a profile.

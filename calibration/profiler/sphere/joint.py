@@ -214,7 +214,7 @@ def sphere_joint(
 def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, OptimizeResult]]:
     """Return the optima of the rigid model from the 24 orientations of a cube, best first.
 
-    a rotation R_FS (3, 3), and the solution about it.
+    A rotation R_FS (3, 3), and the solution about it.
 
     Raises:
         InputError, TooFewTranslations: as sphere_joint.

@@ -98,8 +98,12 @@ class AcquiredFrame(Generic[Datum]):
 class Rules:
     """When a device is at fault, s; None: that rule does not apply.
 
-    silent_s   without a usable frame      frozen_s   with identical frames       late_s   that a frame comes late
-    answer_s   from a request to its frame                                        lost_s   without a connection
+    Attributes:
+        silent_s: without a usable frame.
+        frozen_s: with identical frames.
+        late_s: that a frame comes late.
+        answer_s: from a request to its frame.
+        lost_s: without a connection.
     """
 
     silent_s: float | None = None

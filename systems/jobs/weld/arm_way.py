@@ -146,7 +146,7 @@ def find_way(
 ) -> ArmWay:
     """The first way that works, of the upright tool on the branch of home and of what else the job may use by itself.
 
-    leans: with which the tool has room at the part; None: as far as the job may.
+    ``leans``: with which the tool has room at the part; None: as far as the job may.
 
     Raises:
         InfeasiblePath: of the first of them, with the change that makes the seam feasible where one was found.

@@ -285,7 +285,7 @@ def _refusals(
 ) -> dict[int, tuple[float, str]]:
     """Say why the arm cannot weld seams with the part in a pose, by number, and how near it comes, 0 to 1.
 
-    every: else the seams after the first of them are refused with it.
+    ``every``: else the seams after the first of them are refused with it.
     """
     found = dict[int, tuple[float, str]]()
     for number, part in enumerate(seams):

@@ -45,7 +45,7 @@ NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 class Offer:
     """What of a part's edges a cell's arm can weld with the part in one pose.
 
-    note: in which pieces, or without which edges and why; "" where it is all of them as one seam.
+    ``note``: in which pieces, or without which edges and why; "" where it is all of them as one seam.
     scan_poses_deg: of a scanner on the flange.
     """
 
@@ -70,7 +70,7 @@ class Offer:
 class Seam:
     """A joint of a part, its smallest radius in m (None: straight), and why a tool cannot weld it ("": it can).
 
-    short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
+    ``short_m``: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
     felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was
     asked, too.
     offers: what that arm can weld of it; refused: why not, by edge.

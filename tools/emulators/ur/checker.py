@@ -82,7 +82,7 @@ class Checker:
     def at_rest_after(self, fault_time: float, within: float, speed: float = REST_RAD_S) -> dict[str, Any]:
         """Return whether the arm was at rest `within` seconds after the fault and has not moved since.
 
-        rest_after_s is None where it never came to rest, moved_again_s where it never moved again; travel_m is the
+        ``rest_after_s`` is None where it never came to rest, moved_again_s where it never moved again; travel_m is the
         tool's path from the fault to the first rest (m).
         """
         rows = self._rows()

@@ -34,8 +34,8 @@ def extract_groove(
 ) -> GrooveSeam:
     """Extract the V-groove from a cloud (N,3) or (H,W,3), metres, z roughly up out of the face, NaN where unmeasured.
 
-    hint_A (3,): where several grooves are in view, the one nearest to this point. start_A (3,): the seam starts at the
-    end nearest to it; without it at the end nearest to the origin of A (the robot, for a cloud in its base).
+    ``hint_A`` (3,): where several grooves are in view, the one nearest to this point. start_A (3,): the seam starts at
+    the end nearest to it; without it at the end nearest to the origin of A (the robot, for a cloud in its base).
 
     Raises:
         GrooveNotFound, SeveralGrooves, GrooveTooNarrow, GrooveUncertain: in a sentence; InputError: wrong shape.

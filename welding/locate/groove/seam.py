@@ -34,12 +34,15 @@ class GrooveUncertain(WeldcalError):
 class GrooveConfig:
     """Limits of the groove extraction.
 
-    least_pitches  a groove must be this many point distances wide smoothing_m    width of the Gaussian along the seam
-    most_sigma_m   a root that is less certain than this, outside gaps, is refused longest_gap_m, most_missing   one
-    gap, and the share of the whole seam, that may be bridged steepest_wall_rad             steeper walls cannot be
-    measured from above: an opening that has them is a gap ground_reach_m                search length beyond an end for
-    lower ground, which distinguishes the plate's end from the view's most_bridge_sigma_m           how uncertain the
-    line may be where it is bridged
+    Attributes:
+        least_pitches: a groove must be this many point distances wide.
+        smoothing_m: width of the Gaussian along the seam.
+        most_sigma_m: a root that is less certain than this, outside gaps, is refused.
+        longest_gap_m, most_missing: one gap, and the share of the whole seam, that may be bridged.
+        steepest_wall_rad: steeper walls cannot be measured from above: an opening that has them is a gap.
+        ground_reach_m: search length beyond an end for lower ground, which distinguishes the plate's end from the
+            view's.
+        most_bridge_sigma_m: how uncertain the line may be where it is bridged.
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)

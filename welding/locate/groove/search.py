@@ -19,9 +19,13 @@ from weldcal.welding.locate.planes import Floats, Mask, into, point_pitch, robus
 class SearchConfig:
     """Thresholds for a face and for a groove in it; metres and radians.
 
-    max_width_m   wider openings are not grooves; shortest_m: shorter ones neither; max_depth_m: of the groove max_gap_m
-    two pieces that continue each other across at most this, with no face seen between them, are one groove steepest_rad
-    largest tilt of the face from the up direction
+    Attributes:
+        max_width_m: wider openings are not grooves.
+        shortest_m: shorter openings are not grooves.
+        max_depth_m: of the groove.
+        max_gap_m: two pieces that continue each other across at most this, with no face seen between them, are one
+            groove.
+        steepest_rad: largest tilt of the face from the up direction.
     """
 
     max_width_m: float = 0.020
@@ -37,7 +41,9 @@ class SearchConfig:
 class CoarseGroove:
     """A groove's centre line (N,2) m in the face's frame Q, spaced 1 mm, X_AQ of that face in the cloud's frame.
 
-    sigma_m and pitch_m: the noise of the face's points about it, and the distance between them; width_m of the opening.
+    Attributes:
+        sigma_m, pitch_m: the noise of the face's points about it, and the distance between them.
+        width_m: of the opening.
     """
 
     X_AQ: RigidTransform

@@ -30,10 +30,13 @@ DEPTH_SIGMA = 0.10  # relative, as SLOPE_SIGMA: a root face that is 10 % off its
 class GrooveSection:
     """A fitted cross-section; metres, slopes as rise over run, left then right where there are two.
 
-    centre, root    where the walls meet: n and z; covariance (2,2) of the two
-    slopes, faces   of the walls, and the heights of the face beside them
-    on_walls        points on each wall that agree; agreeing: share of the points that do
-    spread          the walls' points about the profile, in z
+    Attributes:
+        centre, root: where the walls meet: n and z.
+        covariance: (2,2) of the two.
+        slopes, faces: of the walls, and the heights of the face beside them.
+        on_walls: points on each wall that agree.
+        agreeing: share of the points that do.
+        spread: the walls' points about the profile, in z.
     """
 
     centre: float

@@ -32,9 +32,13 @@ LEAST_NEAR, LEAST_MET = 100, 0.5  # rays of a scan that judge its fusion, and th
 class Agreement:
     """Shares of the rays that are predicted to meet the part.
 
-    met: they do; passed: they see through it; hidden: something before it is seen; seen: share of the part's visible
-    surface with a scan point near; goes_on: share of the edges that should end a seen face beyond which the scan shows
-    that face go on; verdict (N,) of all rays: 1 met, -1 passed, 0 else.
+    Attributes:
+        met: they do.
+        passed: they see through it.
+        hidden: something before it is seen.
+        seen: share of the part's visible surface with a scan point near.
+        goes_on: share of the edges that should end a seen face beyond which the scan shows that face go on.
+        verdict: (N,) of all rays: 1 met, -1 passed, 0 else.
     """
 
     met: float

@@ -52,11 +52,13 @@ KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known
 class MeasuredJoint:
     """A seam as measured, in the base, and how far it lies from where the drawing has it.
 
-    seam      the drawn seam with its root moved shift_m   (N,) of the root, at each of the seam's points share     of
-    the seam along which the root was measured in both directions of the cut; share_one: in at least one, for one
-              wall was seen. Across the other the drawing holds.
-    sigma_m   of the root sideways, rms over what was measured in both; nan where nothing was
-    fit_up    how the two parts stand to each other
+    Attributes:
+        seam: the drawn seam with its root moved.
+        shift_m: (N,) of the root, at each of the seam's points.
+        share: of the seam along which the root was measured in both directions of the cut.
+        share_one: the same in at least one direction: one wall was seen, and across the other the drawing holds.
+        sigma_m: of the root sideways, rms over what was measured in both; nan where nothing was.
+        fit_up: how the two parts stand to each other.
     """
 
     seam: DrawnSeam
@@ -82,7 +84,7 @@ class MeasuredJoint:
 def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartModel, seam: DrawnSeam) -> MeasuredJoint:
     """Measure a joint in a scan's points (N,3) with normals (N,3), all in the registered part's frame, m.
 
-    seam: as drawn, in the same frame. Where neither wall is seen, the neighbours and the drawing decide.
+    ``seam``: as drawn, in the same frame. Where neither wall is seen, the neighbours and the drawing decide.
     """
     cut = _cut(points, normals, seam)
     rows = [r for side in ("left", "right") if (r := _wall_rows(cut, model, seam, side, pitch_m)) is not None]
@@ -231,9 +233,11 @@ def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floa
 class FitUp:
     """How two parts stand to each other along a seam, by the scan; NaN where it does not show that.
 
-    s_m    (K,) places along the seam, m values gap (m, between the edges of the two sides), misalignment (m, the left
-    face above the right one) and angle (rad, how much wider
-           the joint opens than drawn), each (K,); sigmas: their standard deviations
+    Attributes:
+        s_m: (K,) places along the seam, m.
+        values: gap (m, between the edges of the two sides), misalignment (m, the left face above the right one) and
+            angle (rad, how much wider the joint opens than drawn), each (K,).
+        sigmas: their standard deviations.
     """
 
     s_m: Floats

@@ -29,8 +29,8 @@ SMOOTHED, SMOOTHED_M, SMOOTHED_COS = 32, 0.010, (math.cos(math.radians(40.0)), m
 class SharpEdges:
     """Samples of the convex edges, one row for each face beside an edge: m and unit vectors.
 
-    point (N,3), tangent (N,3), normal (N,3) of the face, outward (N,3) in the face and away from it, other (N,3) the
-    normal of the face beyond the edge, chain (N,) the number of the straight edge.
+    ``point`` (N,3), tangent (N,3), normal (N,3) of the face, outward (N,3) in the face and away from it, other (N,3)
+    the normal of the face beyond the edge, chain (N,) the number of the straight edge.
     """
 
     point: Floats

@@ -26,17 +26,18 @@ class AmbiguousPart(WorkpieceNotFound):
 class PartConfig:
     """Limits of the search and of the decision.
 
-    min_points      fewest scan points on the part
-    min_agreement   smallest share that meet the part where it is predicted, of the rays that nothing keeps from it
-    min_met         the same of all rays predicted to meet it
-    max_violation   largest share that pass through it
-    max_goes_on     largest share of the edges that should end a seen face beyond which it goes on
-    min_seen        smallest share of the part's visible surface that the scan shows
-    rival           a rival at least this good, in the rays where the two differ, is as good
-    max_sigma_m     how uncertain any of the points that matter may be (rms over them, in the worst direction)
-    reach_m, reach_rad   how far a guess may be off
-    turn_step_rad   step of the turns in the search
-    cell_m          cell of the search, at least; larger for a large scene
+    Attributes:
+        min_points: fewest scan points on the part.
+        min_agreement: smallest share that meet the part where it is predicted, of the rays that nothing keeps from it.
+        min_met: the same of all rays predicted to meet it.
+        max_violation: largest share that pass through it.
+        max_goes_on: largest share of the edges that should end a seen face beyond which it goes on.
+        min_seen: smallest share of the part's visible surface that the scan shows.
+        rival: a rival at least this good, in the rays where the two differ, is as good.
+        max_sigma_m: how uncertain any of the points that matter may be (rms over them, in the worst direction).
+        reach_m, reach_rad: how far a guess may be off.
+        turn_step_rad: step of the turns in the search.
+        cell_m: cell of the search, at least; larger for a large scene.
     """
 
     min_points: int = 250
@@ -58,12 +59,14 @@ class PartConfig:
 class PartRegistration:
     """The pose X_BP of a part, and how well the scan agrees with it.
 
-    covariance   (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation (rad), translation (m)
-    rms_m        rms distance of the scan's points from the part's surface, m
-    agreement    share of the rays predicted to meet the part that do
-    seen         share of the part's surface facing the scanner that the scan shows
-    confidence   0 to 1: agreement less the share that pass through it, reduced by the best other pose
-    summary      the result in one sentence
+    Attributes:
+        covariance: (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation (rad), translation
+            (m).
+        rms_m: rms distance of the scan's points from the part's surface, m.
+        agreement: share of the rays predicted to meet the part that do.
+        seen: share of the part's surface facing the scanner that the scan shows.
+        confidence: 0 to 1: agreement less the share that pass through it, reduced by the best other pose.
+        summary: the result in one sentence.
     """
 
     X_BP: RigidTransform

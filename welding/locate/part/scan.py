@@ -30,8 +30,10 @@ EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 class Plane:
     """Points x with normal . x = level, the normal towards the scanner.
 
-    extent_m: how far the scan shows the plane across; filled: area of its points over that of the square with this
-    diagonal; own_m: height over it within which a point is its own.
+    Attributes:
+        extent_m: how far the scan shows the plane across.
+        filled: area of its points over that of the square with this diagonal.
+        own_m: height over it within which a point is its own.
     """
 
     normal: Floats
@@ -60,7 +62,7 @@ class View:
 class PreparedScan:
     """Points (N,3) m in base with normals towards the scanner, a coarse copy, and the planes in them.
 
-    view (N,): index in `views` of each point's scan; planes: the largest, largest first; pitch_m: distance between
+    ``view`` (N,): index in `views` of each point's scan; planes: the largest, largest first; pitch_m: distance between
     neighbouring points as measured.
     """
 

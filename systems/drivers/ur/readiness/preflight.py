@@ -125,9 +125,9 @@ class Check:
 class Preflight:
     """All checks, and the values read for them (None where not read).
 
-    arm_q (6,) rad, tcp_pose and tcp_offset (6,) as x, y, z (m) and a rotation vector (rad), the controller's version,
-    the robot's kinematics and the arm with it, the distance of the computed flange pose from the controller's, and the
-    register range for the driver.
+    ``arm_q`` (6,) rad, tcp_pose and tcp_offset (6,) as x, y, z (m) and a rotation vector (rad), the controller's
+    version, the robot's kinematics and the arm with it, the distance of the computed flange pose from the controller's,
+    and the register range for the driver.
     """
 
     host: str

@@ -187,8 +187,8 @@ class UrRtdeSwitch:
 def send_at_once(port: int) -> int:
     """Turn Nagle's algorithm off on this process's connections to a port; returns on how many it was on.
 
-    ur_rtde sets the option before it connects, which opens another socket. Without it a command waits up to 40 ms for
-    the controller's next package, which is long where states are lost.
+    ``ur_rtde`` sets the option before it connects, which opens another socket. Without it a command waits up to 40 ms
+    for the controller's next package, which is long where states are lost.
     """
     changed = 0
     for name in os.listdir("/proc/self/fd"):
