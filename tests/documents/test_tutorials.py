@@ -54,7 +54,7 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> Executed:
     @cache
     def execute(name: str) -> tuple[Path, str]:
         folder = execute(BEFORE[name])[0] if name in BEFORE else tmp_path_factory.mktemp(name)
-        for file in FOLDER.glob("*.py"):
+        for file in (*FOLDER.glob("*.py"), *FOLDER.glob("*.step")):
             shutil.copy(file, folder)
         finished = subprocess.run(
             [sys.executable, "-P", "-c", RUNNER],
