@@ -6,20 +6,17 @@ import re
 import shlex
 import subprocess
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import typer.main
 from markdown_it import MarkdownIt
 
 from tests.documents.blocks import all_blocks
-from tests.figures.__main__ import app as figures
+from tests.documents.command_lines import program
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
-from weldcal.tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -60,14 +57,6 @@ def quoted_commands(document: Path) -> list[str]:
 
 TYPED = [(document.relative_to(ROOT).as_posix(), line) for document in DOCUMENTS for line in typed_lines(document)]
 QUOTED = [(document.relative_to(ROOT).as_posix(), line) for document in DOCUMENTS for line in quoted_commands(document)]
-
-
-@cache
-def program() -> Any:
-    """The whole command line, and below `figures` that of the studies; made once, since it takes a fifth of a second."""
-    found: Any = typer.main.get_command(app)
-    found.commands["figures"] = typer.main.get_command(figures)
-    return found
 
 
 def leaves(command: Any, name: str = "") -> Iterator[str]:

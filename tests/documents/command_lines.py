@@ -6,8 +6,14 @@ import re
 import shlex
 import sys
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
+import typer.main
+
+from tests.figures.__main__ import app as figures
 from tests.places import ROOT
+from weldcal.tools.cli.app import app
 
 ROBOT, EMULATED = "192.168.56.101", "127.30.0.9"  # the robot of the pages, and the emulated one in its place
 
@@ -132,6 +138,14 @@ class CommandLine:
         """The words to run, in the short form or in full, with the emulated robot in place of the real one."""
         words = self.words if full else shlex.split(self.short())
         return [word.replace(ROBOT, EMULATED) for word in words]
+
+
+@cache
+def program() -> Any:
+    """The whole command line, and below `figures` that of the studies; made once, since it takes a fifth of a second."""
+    found: Any = typer.main.get_command(app)
+    found.commands["figures"] = typer.main.get_command(figures)
+    return found
 
 
 def process(arguments: list[str]) -> list[str]:

@@ -11,12 +11,11 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import typer.main
 from typer.testing import CliRunner
 
 import weldcal
 from tests.documents.blocks import DOCUMENTS, FENCE, Block, all_blocks, blocks_of, is_command
-from tests.documents.command_lines import SHORT, CommandLine
+from tests.documents.command_lines import SHORT, CommandLine, program
 from tests.documents.execution import ELSEWHERE, FAILED, WRITTEN, Check, Page, entry_points_of
 from tests.documents.props import PROPS, lay_out, named_in, needs_data
 from tests.documents.yaml_blocks import check_yaml
@@ -190,9 +189,9 @@ def test_no_command_stands_in_a_block_that_is_not_found() -> None:
 def test_every_short_form_is_of_a_line_and_can_be_typed() -> None:
     unused = [pattern for pattern, _ in SHORT if not any(re.search(pattern, line.name) for line in LINES)]
     assert unused == []
-    program = typer.main.get_command(app)
+    whole = program()
     for line in LINES:
-        words, command = line.arguments(full=False), program
+        words, command = line.arguments(full=False), whole
         while not line.elsewhere and hasattr(command, "commands"):
             command = command.commands[words.pop(0)]
         if not line.elsewhere:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.places import ROOT
 from tests.worlds.hand_eye import imperfect_cell, ratios
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.models.errors import InputError
@@ -48,7 +49,8 @@ def test_a_killed_study_goes_on_with_the_tasks_that_are_missing(tmp_path: Path) 
     script = tmp_path / "study.py"
     script.write_text(STUDY)
     journal = tmp_path / "out" / NAME
-    study = subprocess.Popen([sys.executable, "-P", str(script), str(tmp_path / "out")], start_new_session=True)
+    command, environment = [sys.executable, "-P", str(script), str(tmp_path / "out")], {"PYTHONPATH": str(ROOT)}
+    study = subprocess.Popen(command, start_new_session=True, env=os.environ | environment)
     try:
         end = time.monotonic() + 120.0
         while not (journal.exists() and journal.read_bytes().count(b"\n") > 2):
