@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
@@ -176,7 +177,10 @@ class Bench:
         """
         self.emulator.do("reset_checker")
         command = [sys.executable, "-m", "tests.worlds.robot.bench", self.host, self.transport]
-        self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        self._child = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         self.cruise()
         self._workers = worker_of(self._child.pid)
         return self._workers
