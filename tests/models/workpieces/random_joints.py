@@ -234,7 +234,7 @@ def write_stl(solids: list[Any], path: Path) -> None:
     """Write solids one after another as a binary STL file, as CAD programs export them."""
     from weldcal.models.workpieces.step import _mesh
 
-    meshes = [_mesh(solid, path)[0] for solid in solids]
+    meshes = [_mesh(solid, path) for solid in solids]
     corners = np.concatenate([1e3 * mesh.vertices[mesh.triangles] for mesh in meshes]).astype("<f4")
     rows = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("word", "<u2")])
     rows["corners"] = corners
