@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
 from tests.worlds.parts.step_parts import assembly, box, write_step
@@ -22,11 +22,13 @@ from weldcal.systems.messages import PlannedSeam, Scan, ScanView
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
+from weldcal.tools.commands.cell import scan_poses
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.run import RunOptions
 
+UP = np.array([0.0, 0.0, 1.0])
 SHORT = "workpiece: {{seams: [{{edges: {edges}, start_mm: {start}}}]}}\nwelding: {{seam_length_mm: 40.0}}"
 
 
@@ -116,6 +118,16 @@ def test_a_scanner_beside_the_arm_that_shows_too_little_names_the_other_cell(tmp
     assert written.name == "unfinished.yaml"
     assert "The part is 1.5 m long, and the scanner beside the arm shows 0.82 m of it" in reason
     assert "new FOLDER --part FILE --from carried_scanner" in reason
+
+
+def test_a_part_whose_end_is_in_view_is_looked_for_in_one_scan() -> None:
+    """A scanner 0.9 m above the table shows 0.8 m; a beam of 1.5 m lies centred below it, or with one end there."""
+    scanner, X_BC, up = get_scanner("phoxi_m"), RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, 0.9]), UP
+    beam = extrude(np.array([[-0.75, -0.05], [0.75, -0.05], [0.75, 0.05], [-0.75, 0.05]]), 0.0, 0.1)
+    for aside, sought in ((0.0, False), (0.3, False), (0.4, True), (0.75, True)):
+        part = beam.transformed(RigidTransform([aside, 0.0, 0.0]))
+        assert (scan_poses._too_long(part, scanner, X_BC, up, ends=True) == "") is sought
+        assert scan_poses._too_long(part, scanner, X_BC, up).startswith("The part is 1.5 m long")
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,6 @@ CARRIED = "carried_scanner"
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TRIED_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 TABLE_PITCH_M = 0.004  # between its points: a choice, fine beside a finger
-NO_END = 1.2  # times what a scanner shows: a longer part has no end in view, and is not looked for
 SCAN_S, SCAN_S_EACH = 8.0, 5e-4  # of processor time to find a part in a scan, and more for each of its triangles
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
@@ -70,14 +69,19 @@ def add_scan_poses(scenario: Scenario, path: Path) -> str:
     return ""
 
 
-def _too_long(part: TriMesh, X_BP: RigidTransform, scanner: RenderedScanner, up: Array, beyond: float = 1.0) -> str:
-    """Say that a part is longer than what a scanner beside the arm shows, by a factor; "" where it is not."""
-    away = float(np.linalg.norm(X_BP @ (0.5 * part.bounds.sum(axis=0)) - np.array(scanner.xyz_m)))
-    shown = max(scanner.scanner().footprint_m(away))
-    size = _lying(part.transformed(X_BP), up)[1][0]
+def _too_long(part_B: TriMesh, scanner: ScannerPreset, X_BC: RigidTransform, up: Array, ends: bool = False) -> str:
+    """Say that a part is longer than what a scanner beside the arm shows; "" where it is not.
+
+    ends: "" also where an end of the part is in view.
+    """
+    axes, (size, *_), middle = _lying(part_B, up)
+    away = float(np.linalg.norm(middle - X_BC.translation()))
+    shown = max(scanner.footprint_m(away))
+    aside = abs(float(axes[:, 0] @ (middle - X_BC @ np.array([0.0, 0.0, away]))))
+    if size <= shown or (ends and 0.5 * size - aside < 0.5 * shown):
+        return ""
     words = f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it"
-    advice = f"Let the arm carry the scanner along the part: weldcal new FOLDER --part FILE --from {CARRIED}."
-    return "" if size <= beyond * shown else f"{words}. {advice}"
+    return f"{words}. Let the arm carry the scanner along the part: weldcal new FOLDER --part FILE --from {CARRIED}."
 
 
 def _part(scenario: Scenario, station: Station) -> tuple[WeldPart, RigidTransform]:
@@ -323,19 +327,17 @@ def _at_the_table(planning: SeamPlanning, part: WeldPart, plan: PlannedSeam) -> 
 def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseConfig) -> str:
     """Why the job does not find a part in a scan of it, turned and displaced as the scenario says; "" where it does."""
     scanner, placed = scenario.scanner, scenario.workpiece
-    if (
-        not isinstance(scanner, RenderedScanner)
-        or scanner.mounted_on != "base"
-        or placed is None
-        or placed.located_by != "scan"
-    ):
+    if not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
+        return ""
+    if placed is None or placed.located_by != "scan":
         return ""
     X_BC = PoseConfig(list(scanner.xyz_m), list(scanner.rpy_deg)).pose()
     off = RotationMatrix.MakeZRotation(np.deg2rad(placed.placement_error.rotation_deg))
     middle = guess.pose() @ (0.5 * part.mesh.bounds.sum(axis=0))
     shift = 1e-3 * placed.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
     X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess.pose()
-    if longer := _too_long(part.mesh, X_BP, scanner, station.arm.up, NO_END):
+    seen = part.mesh.transformed(X_BP), scanner.scanner(), X_BC, station.arm.up
+    if longer := _too_long(*seen, ends=True):
         return longer
     low, high = PLACE_M - np.array(TRIED_M), PLACE_M + np.array(TRIED_M)
     z = scenario.calibration.table_z_m
@@ -348,7 +350,7 @@ def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseCon
         seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=False
     )
     reason = plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason
-    return "" if reason is None else _too_long(part.mesh, X_BP, scanner, station.arm.up) or reason
+    return "" if reason is None else _too_long(*seen) or reason
 
 
 def standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
