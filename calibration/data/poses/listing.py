@@ -109,14 +109,8 @@ class Listing:
 
     def of_joints(self) -> "Listing":
         """Return the list of its joint angles alone, which stand for the robot's poses."""
-        return Listing(
-            name=f"{self.name.partition(',')[0]}, joints",
-            numbers=(),
-            ids=self.ids,
-            times=self.times,
-            form="joint angles",
-            joints=self.joints,
-        )
+        name = f"{self.name.partition(',')[0]}, joints"
+        return replace(self, name=name, numbers=(), form="joint angles", left_out=())
 
     def of_arm(self, arm: str | None) -> "Listing":
         """Return the list with the flange's poses of an arm where it holds joint angles alone.

@@ -195,9 +195,10 @@ def _check_own(robot: Listing, camera: Listing) -> None:
     if robot.joints is None or len(robot) != len(camera) or robot.name.rpartition(", ")[2] != "joints":
         return
     R = robot.readings[0].X[:, :3, :3]
+    limit = min(_OWN_RAD, 0.1 * float(np.ptp(R, axis=0).max()))  # an arm that hardly turns shows nothing of it
     for one in camera.readings:
         tool = np.swapaxes(R, 1, 2) @ one.X[:, :3, :3]
-        if float(np.abs(tool[camera.good] - tool[camera.good][:1]).max(initial=0.0)) < _OWN_RAD:
+        if float(np.ptp(tool[camera.good], axis=0).max(initial=0.0)) < limit:
             raise DatasetError(
                 f"The poses in '{camera.name}' are those of the joint angles beside them, and the camera's are"
                 " missing: give these as a second list."

@@ -177,6 +177,20 @@ def test_poses_of_the_tool_beside_its_joint_angles_are_no_pairs(tmp_path: Path) 
         read_pairs(tmp_path / "log.csv", mounting="eye_in_hand", stated=StatedForms(arm="ur10e"))
 
 
+def test_an_arm_that_does_not_turn_has_camera_poses_beside_its_joint_angles(tmp_path: Path) -> None:
+    """Moved along the base's axes alone, the camera's poses do not turn either."""
+    still = ANGLES[0] + 1e-4 * np.random.default_rng(1).normal(size=ANGLES.shape)
+    arm = np.array([flange(q) for q in still])
+    rows = [
+        [*q, *X[:3, 3], *Rotation.from_matrix(X[:3, :3]).as_quat()]
+        for q, X in zip(still, np.linalg.inv(arm), strict=True)
+    ]
+    text = "\n".join(",".join(f"{v:.12f}" for v in row) for row in rows)
+    (tmp_path / "log.csv").write_text(HEADERS["j"] + ",x,y,z,qx,qy,qz,qw\n" + text + "\n")
+    found = read_pairs(tmp_path / "log.csv", mounting="eye_in_hand", stated=StatedForms(arm="ur10e"))
+    assert found.camera == pytest.approx(np.linalg.inv(arm), abs=1e-6)
+
+
 @pytest.mark.parametrize("header", ["x,y,z,qx,qy,qz,qw,u,v", "x,y,z,rx,ry,rz,e,theta", "u,v,x,z"])
 def test_pixels_and_errors_are_no_part_of_a_pose(header: str) -> None:
     names = header.split(",")
