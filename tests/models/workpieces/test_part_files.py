@@ -23,6 +23,7 @@ from weldcal.models.workpieces.brep import MeshBody, MeshFace, parts_of
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
 from weldcal.models.workpieces.step import referenced
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
 
 if TYPE_CHECKING:
@@ -391,6 +392,7 @@ def test_an_assembly_takes_its_bodies_from_the_files_beside_it(tmp_path: Path, m
     assert found.joints[0].length_m == pytest.approx(known.joints[0].length_m, abs=1e-9)
     cell, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(top))
     assert (cell.name, sorted(file.name for file in referenced(cell.parent / "top.step"))) == ("cell.yaml", names)
+    assert load_scenario(str(cell)).calibration.maximum_scans == 20  # after 12 a saddle expected 0.172 mm of 0.150
     assert re.match(r"Without edges \d+, \d+: shorter than the 20 mm that the tip needs\.", note)  # the web's ends
     (top.parent / names[1]).unlink()
     with pytest.raises(InputError, match=f"takes a body from '{names[1]}': put that file beside it"):
