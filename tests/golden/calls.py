@@ -77,7 +77,7 @@ LIVE = {
     "live_co_manipulation": "hand-eye live co_manipulation",
     "live_profiler": "profiler live profiler_edge",
     "live_seam": "profiler live profiler_seam",
-    "live_tablet": "tablet demo tablet",
+    "live_tablet": "tablet demo",
 }
 """A scenario each, in simulation, with seed 1."""
 

@@ -14,7 +14,7 @@ Figures = dict[str, Value]
 
 # Keys that differ between two runs of the same code: processor and wall time, versions, hashes, places.
 VOLATILE = re.compile(
-    r"(^|\.)(seconds|wall_s|cpu_s|elapsed_s|pace|started|finished|version|software|hash(es)?|sha256|report|out|folder"
+    r"(^|\.)(seconds|wall_s|cpu_s|elapsed_s|wall_seconds|real_time_factor|pace|started|finished|version|software|hash(es)?|sha256|report|out|folder"
     r"|file|files|path|paths|written|dataset|calibration|recording|backends|compute_ms|timing|host)(\.|$)|_ms$|_wall_s$"
 )
 RELATIVE = 1e-6  # of a number: another order of additions changes far less
