@@ -322,13 +322,14 @@ def test_the_outside_of_a_mitre_is_refused_with_what_to_do(tmp_path: Path) -> No
 
 
 def test_seams_are_ranked_as_a_welder_would(tmp_path: Path) -> None:
-    """A long thick rib, a short one, then a bolt by its name and a board on it that is ten times as thick as its tube."""
+    """A long thick rib, a short one, a thin sheet, a strip that is too low to weld, and last a bolt by its name."""
     bodies = {
         "base": box((0, 0, -10), (600, 400, 10)),
         "M10 bolt": cylinder((500, 350, 0), 60, 30),
         "rib": box((50, 60, 0), (150, 10, 40)),
         "long rib": box((50, 200, 0), (300, 10, 40)),
         "sheet": box((50, 330, 0), (350, 1.5, 40)),
+        "strip": box((50, 370, 0), (350, 10, 0.5)),
     }
     write_step(assembly(*bodies.values()), tmp_path / "a.step")
     text = (tmp_path / "a.step").read_text()
@@ -338,6 +339,9 @@ def test_seams_are_ranked_as_a_welder_would(tmp_path: Path) -> None:
     seams = ranked(read_shape(tmp_path / "a.step"), load_tool(WELDING).tool)
     order = list(dict.fromkeys(seam.joint.bodies[1] for seam in seams))
     assert order[:2] == ["long rib", "rib"]
+    assert seams[-1].joint.bodies[1] == "M10 bolt"
+    assert not seams[-1].reason
+    assert seams[-2].reason
     assert [round(1e3 * v) for v in seams[0].joint.thick_m] == [10, 10]
 
 

@@ -107,7 +107,7 @@ def with_plans(
         reason = "" if offers else seam.reason or " ".join(each)
         found.append(replace(seam, reason=reason, offers=tuple(offers), refused=refused, planned=True))
     rest = seams[len(found) :]
-    return sorted([*found, *rest], key=lambda seam: bool(seam.reason))
+    return sorted([*found, *rest], key=lambda seam: (seam.purchased, bool(seam.reason)))
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:

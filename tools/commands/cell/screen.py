@@ -86,6 +86,11 @@ class Seam:
     refused: Mapping[int, str] = field(default_factory=dict)
 
     @property
+    def purchased(self) -> bool:
+        """Whether a body of it is a purchased part by its name."""
+        return any(PURCHASED.search(name) for name in self.joint.bodies)
+
+    @property
     def verdict(self) -> str:
         """Whether it can be welded, for a table."""
         if self.reason:
@@ -130,7 +135,7 @@ def side_of(edge: PartEdge) -> str:
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     """Sort a part's joints as a welder would: those that the tool can weld first, then the nearest misses.
 
-    Of them purchased parts and plates of unlike thickness come last. The felt and the upward ones come first, then
+    Purchased parts come after all of them; plates of unlike thickness after the others of their kind. The felt and the upward ones come first, then
     those with the largest length times thinner plate. The arm is not asked.
 
     Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
@@ -154,11 +159,10 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
 def _order(shape: PartShape, seam: Seam) -> tuple[Any, ...]:
     j, thin, thick = seam.joint, min(seam.joint.thick_m), max(seam.joint.thick_m)
     unlike = thick > 0.0 and (thin < LEAST_PLATE_M or thick > UNLIKE * thin)  # a board on a tube, a shaft in a sheet
-    unlikely = unlike or any(PURCHASED.search(name) for name in j.bodies)
     length_m = j.length_m - sum(shape.edge(id).length_m for id in seam.refused if not seam.reason)
     worth = round(length_m * min(thin or MOST_PLATE_M, MOST_PLATE_M), 7)  # m2
     above = j.up_P[2] > OPEN_ABOVE
-    fits = bool(seam.reason), unlikely, not seam.felt, round(seam.short_m, 3)
+    fits = seam.purchased, bool(seam.reason), unlike, not seam.felt, round(seam.short_m, 3)
     return (*fits, not above, seam.short_m, -worth)
 
 
