@@ -29,7 +29,7 @@ from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import check_length, touch_step
-from weldcal.welding.servo.track import torch_target, weaving
+from weldcal.welding.servo.track import TickMotion, TorchTarget, torch_target, weaving
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
@@ -286,77 +286,27 @@ def _tip_residual(state: WeldingState) -> Array:
 def _weld(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
-    assert state.plan_fit is not None
-    law = get_law(config.law)
-    curve = state.plan_fit.curve
-    p_BT = np.asarray(sample.X_BT.translation())
-    at = p_BT
-    if state.measurement is not None and (state.phase == Phase.TRACK or state.settling):
-        # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
-        at = state.measurement.point + (p_BT - state.measurement.p_BT)
-    s_tip = curve.nearest(at, state.s_tip)
-    seam = curve.frame(s_tip)
-    gap = p_BT - seam.position
-    off = np.array((dot(gap, seam.normal), dot(gap, seam.up)))
-    state = changed(state, s_tip=s_tip)
-    if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
-        text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
-        return _rest(fault(state, text), config)
-    beyond, cut_short = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0, goes_on(state, config)
-    # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
-    last = curve.drawn_m if cut_short and state.phase == Phase.TRACK else state.s_end
-    if law.guarded and state.phase != Phase.FINISH and s_tip > last + beyond:
-        # Still in contact this far beyond the plan's end: the seam does not end before this point.
-        state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not cut_short else state)
+    """One tick in TRACK, COAST or FINISH: the tip along the seam, the torch to its target, the arc on its pieces."""
+    state, seam, off = _on_seam(state, sample)
+    state = _ended(state, config)
+    if state.phase == Phase.FAULT:
+        return _rest(state, config)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off - _press(config))
-
-    state = _slewed(state, *_servo(state, off, sample, config), config, dt)
-    p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
-    target = torch_target(state, curve, p_BW, config)
-    if state.torch_on and config.weave.amplitude_m > 0.0:
-        state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
-    motion = motion_law(law)(
-        state, sample.X_BT, turned(seam, state.felt + state.steer), target, (state.u_n, state.u_a), config, dt
-    )
-    e = p_BW - target.point
-    e_n, e_b = dot(e, target.normal), dot(e, target.up)
-    state = changed(
-        with_progress(state, sample.time, motion.v_tip, dt),
-        s_torch=target.s,
-        torch_arc=target.arc,
-        residual=target.residual,
-        v_tip=motion.v_tip,
-        omega=motion.omega,
-    )
-    error = math.hypot(e_n, e_b)
-    state, problem = advance(state, target.s, sample.time, config)
-    problem = problem or angles(sample, target, config)
-    if problem is not None and (state.torch_on or state.phase == Phase.COAST):
-        return _rest(fault(state, problem), config)
-    if state.torch_on and error > config.faults.torch_error_m:
-        text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
-        return _rest(fault(state, text), config)
-    # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
-    piece, torch, on_the_way = current_piece(state, config), config.torch, way_to_rest_m(motion.v_torch, config)
-    if piece is not None:
-        there = target.s >= piece.start - (on_the_way if torch.from_rest else 0.0) and error < torch.ignition_error_m
-        burning = (state.torch_on or there) and target.s < piece.end
-        if burning and not state.torch_on and torch.from_rest:
-            return _stand(state, motion.V_BT, Stand.START, config)
-        if burning and state.torch_on and torch.crater_s > 0.0 and target.s >= piece.end - on_the_way:
-            return _stand(state, motion.V_BT, Stand.CRATER, config)
-        lit_at = sample.time if burning and not state.torch_on else state.lit_at
-        over = config.stitch.on_m > 0.0 and state.torch_on and not burning
-        state = stitched(state, config) if over else changed(state, torch_on=burning, lit_at=lit_at)
-        problem = None if over else unlit(state, target.s, target.s - piece.start, error, config)
+    state, target, motion, error = _moved(state, sample, seam, off, config, dt)
+    state, problem = _torch_problem(state, sample, target, error, config)
+    state, why, problem = _arc_step(state, sample.time, target.s, motion.v_torch, error, problem, config)
+    if why is not None:
+        # The tool begins to come to rest, with the motion of this tick still.
+        state = stand(changed(state, V=motion.V_BT), why)
+        return _answer(state, state.V_stop, config, Diagnostics())
     if problem is not None:
         return _rest(fault(state, problem), config)
     if target.s >= state.s_end:
         return _rest(_done(state), config)
     diagnostics = Diagnostics(
-        e_t=e_n,
-        e_height=e_b,
+        e_t=error[0],
+        e_height=error[1],
         n_d_dot_n_t=motion.conditioning.cos_torch,
         conditioning=motion.conditioning.value,
         omega=motion.omega,
@@ -367,10 +317,103 @@ def _weld(
     return _answer(state, motion.V_BT, config, diagnostics)
 
 
-def _stand(state: WeldingState, V: Array, why: Stand, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """Return the tick in which the tool begins to come to rest, with the motion of this tick still."""
-    state = stand(changed(state, V=V), why)
-    return _answer(state, state.V_stop, config, Diagnostics())
+def _on_seam(state: WeldingState, sample: ServoSample) -> tuple[WeldingState, SeamFrame, Array]:
+    """The state with the tip's arc length, the seam's frame there, and what the tool is off it: (2,) m left and up."""
+    assert state.plan_fit is not None
+    curve = state.plan_fit.curve
+    p_BT = np.asarray(sample.X_BT.translation())
+    at = p_BT
+    if state.measurement is not None and (state.phase == Phase.TRACK or state.settling):
+        # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
+        at = state.measurement.point + (p_BT - state.measurement.p_BT)
+    s_tip = curve.nearest(at, state.s_tip)
+    seam = curve.frame(s_tip)
+    gap = p_BT - seam.position
+    return changed(state, s_tip=s_tip), seam, np.array((dot(gap, seam.normal), dot(gap, seam.up)))
+
+
+def _ended(state: WeldingState, config: ServoConfig) -> WeldingState:
+    """FAULT where the tip coasts for too long, FINISH where it is past the end of what it feels; else as it is."""
+    assert state.plan_fit is not None
+    tracks, cut_short = state.phase == Phase.TRACK, goes_on(state, config)
+    if state.phase == Phase.COAST and state.s_tip - state.lost_at > config.gap.coast_m:
+        text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
+        return fault(state, text)
+    if not get_law(config.law).guarded or state.phase == Phase.FINISH:
+        return state
+    # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
+    last = state.plan_fit.curve.drawn_m if cut_short and tracks else state.s_end
+    if state.s_tip <= last + (config.gap.end_window_m if tracks else 0.0):
+        return state
+    # Still in contact this far beyond the plan's end: the seam does not end before this point.
+    return finish(changed(state, s_end=state.s_tip) if tracks and not cut_short else state)
+
+
+def _moved(
+    state: WeldingState, sample: ServoSample, seam: SeamFrame, off: Array, config: ServoConfig, dt: float
+) -> tuple[WeldingState, TorchTarget, TickMotion, tuple[float, float]]:
+    """The motion of this tick, the torch's target, and what the wire is off it: m to the left and up."""
+    assert state.plan_fit is not None
+    state = _slewed(state, *_servo(state, off, sample, config), config, dt)
+    p_BW = np.asarray(sample.X_BT.translation()) + sample.X_BT.rotation().matrix() @ config.p_TW
+    target = torch_target(state, state.plan_fit.curve, p_BW, config)
+    if state.torch_on and config.weave.amplitude_m > 0.0:
+        state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
+    motion = motion_law(get_law(config.law))(
+        state, sample.X_BT, turned(seam, state.felt + state.steer), target, (state.u_n, state.u_a), config, dt
+    )
+    e = p_BW - target.point
+    state = changed(
+        with_progress(state, sample.time, motion.v_tip, dt),
+        s_torch=target.s,
+        torch_arc=target.arc,
+        residual=target.residual,
+        v_tip=motion.v_tip,
+        omega=motion.omega,
+    )
+    return state, target, motion, (dot(e, target.normal), dot(e, target.up))
+
+
+def _torch_problem(
+    state: WeldingState, sample: ServoSample, target: TorchTarget, error: tuple[float, float], config: ServoConfig
+) -> tuple[WeldingState, str | None]:
+    """The state with the torch's progress; a sentence where it does not advance, is too far off or leaves its angles."""
+    state, problem = advance(state, target.s, sample.time, config)
+    problem = problem or angles(sample, target, config)
+    off_m = math.hypot(*error)
+    if problem is None and state.torch_on and off_m > config.faults.torch_error_m:
+        problem = f"The torch is {1e3 * off_m:.1f} mm off the seam; check the groove and the plan."
+    return state, problem
+
+
+def _arc_step(
+    state: WeldingState,
+    now: float,
+    s: float,
+    v_torch: Array,
+    error: tuple[float, float],
+    problem: str | None,
+    config: ServoConfig,
+) -> tuple[WeldingState, Stand | None, str | None]:
+    """The arc at arc length `s` m of the torch: the next state, why the tool comes to rest, and the problem left.
+
+    A problem stops what burns or coasts at once. On the way to a piece only an arc that is not lit counts.
+    """
+    piece, torch = current_piece(state, config), config.torch
+    if piece is None or (problem is not None and (state.torch_on or state.phase == Phase.COAST)):
+        return state, None, problem
+    on_the_way, off_m = way_to_rest_m(v_torch, config), math.hypot(*error)
+    # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
+    there = s >= piece.start - (on_the_way if torch.from_rest else 0.0) and off_m < torch.ignition_error_m
+    burning = (state.torch_on or there) and s < piece.end
+    if burning and not state.torch_on and torch.from_rest:
+        return state, Stand.START, None
+    if burning and state.torch_on and torch.crater_s > 0.0 and s >= piece.end - on_the_way:
+        return state, Stand.CRATER, None
+    if config.stitch.on_m > 0.0 and state.torch_on and not burning:
+        return stitched(state, config), None, None
+    state = changed(state, torch_on=burning, lit_at=now if burning and not state.torch_on else state.lit_at)
+    return state, None, unlit(state, s, s - piece.start, off_m, config)
 
 
 def _done(state: WeldingState) -> WeldingState:
