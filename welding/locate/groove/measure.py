@@ -129,87 +129,16 @@ def _finish(
     """Ends, gaps, smoothed lines and their sigmas, in the cloud's frame and in the direction of travel."""
     if len(slices.s) < 5:
         raise GrooveNotFound("An opening was found whose cross-sections show no V: it is not a groove to weld.")
-    pitch = groove.pitch_m
     refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
-    first, last, gaps = measured_extent(f, line, profile, slices, groove)
-    gaps = [_unmeasured(gap, slices) for gap in gaps]
-    if groove.closed:
-        first, last = 0.0, line.length
-    ends_seen = (True, True)
-    if not groove.closed:
-        ends_seen = ends_at_edges(around, (first, last), line, profile, config.ground_reach_m)
-        # The last section at the edge of a shadow is not reliable.
-        first = first if ends_seen[0] else max(first, float(slices.s[1]))
-        last = last if ends_seen[1] else min(last, float(slices.s[-2]))
-    missing = sum(b - a for a, b in gaps)
-    longest = max((b - a for a, b in gaps), default=0.0)
-    gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
-    if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
-        raise GrooveUncertain(
-            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan"
-            " again from elsewhere."
-        )
+    first, last, gaps, ends_seen = _seen(f, around, line, slices, groove, profile, config)
     at = np.linspace(first, last, max(8, round((last - first) / STATION_M) + 1))
     for corner in corners:
         at = np.unique(np.append(at[np.abs(at - corner.s) > 0.0022], corner.s + np.arange(-0.002, 0.0021, 0.00025)))
     at = at[(at >= first) & (at <= last)]
-    sigma, sigma_z = slices.sigma, slices.sigma_height
     width = max(config.smoothing_m, 2.0 * slices.half_slice)
-    values = {
-        "centre": (slices.column("centre"), sigma),
-        "root": (slices.column("root"), sigma_z),
-        "angle": (slices.column("angle"), sigma_z),
-        "left": (np.array([x.shoulders[0] - x.centre for x in slices.sections]), sigma),
-        "right": (np.array([x.shoulders[1] - x.centre for x in slices.sections]), sigma),
-        "face_left": (np.array([x.faces[0] for x in slices.sections]), np.ones(len(sigma))),
-        "face_right": (np.array([x.faces[1] for x in slices.sections]), np.ones(len(sigma))),
-    }
-    smooth: dict[str, Floats] = {}
-    errors: dict[str, Floats] = {}
-    for name, (value, spread) in values.items():
-        own = smoothing_weights(slices.s, slices.s, spread, 2.0 * width)
-        off = (value - own @ value) / (spread * np.sqrt(np.maximum(1.0 - np.diag(own), 0.1)))
-        scale = 1.4826 * float(np.median(np.abs(off)))
-        spread = spread * np.maximum(1.0, np.abs(off) / max(4.0 * scale, 1e-12))
-        W = smoothing_weights(at, slices.s, spread, width)
-        smooth[name] = W @ value
-        errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
-    for a, b in gaps:
-        hidden = (at > a) & (at < b)
-        bend = max(line.tightest_bend((a, b)), 2.0)
-        # Sections next to a shadow are few: a bridge is not much better known at its ends than in its middle.
-        lever = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
-        errors["centre"][hidden] += 0.25 * bend * lever
-    # Where one wall was not measured the edge of the face replaces it, with an error common to the whole line.
-    one_walled = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
-    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(one_walled)), width) @ one_walled, 0.0, 1.0)
-    sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
-    sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
-    if not groove.closed:
-        # The last sections have neighbours on one side only, and contain points of the plate's edge.
-        sigma = np.hypot(sigma, END_PITCHES * pitch * np.exp(-np.minimum(at - first, last - at) / END_REACH_M))
-    for corner in corners:
-        reach = max(corner.blind, corner.radius, CORNER_REACH_M)
-        sigma = np.hypot(sigma, corner.sigma * np.exp(-0.5 * np.square((at - corner.s) / reach)))
-    seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
-    for corner in corners:
-        if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
-            raise GrooveUncertain(
-                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f}"
-                f" mm from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart). Use a"
-                " finer scanner or move it nearer."
-            )
-    if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
-        raise GrooveUncertain(
-            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan"
-            f" (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and"
-            f" {1e3 * config.most_sigma_m:.2f} mm are required. Use a finer scanner or move it nearer."
-        )
-    if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
-        raise GrooveUncertain(
-            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its line there is only known to "
-            f"{1e3 * np.max(sigma[~seen]):.1f} mm: clear the view or scan again from elsewhere."
-        )
+    smooth, errors = _smoothed(at, slices, width)
+    sigma = _line_sigma(at, line, slices, groove, gaps, corners, errors["centre"], width, (first, last))
+    _refuse_uncertain(at, sigma, gaps, [c for c in corners if first < c.s < last], groove, config)
     base, normal = line.at(at)
     moved = base + smooth["centre"][:, None] * normal
     root = np.column_stack([moved, smooth["root"]])
@@ -227,12 +156,8 @@ def _finish(
     target = np.zeros(3) if start_A is None else np.asarray(start_A, dtype=np.float64)
     what = "the robot" if start_A is None else "the point given"
     word = f"starts at the end nearest to {what}"
-    per_station = [
-        sigma,
-        np.hypot(errors["root"], math.hypot(0.25 * SIGMA_FLOOR_PITCHES * pitch, HEIGHT_FLOOR_NOISE * groove.sigma_m)),
-        depth,
-        smooth["angle"],
-    ]
+    height_floor = math.hypot(0.25 * SIGMA_FLOOR_PITCHES * groove.pitch_m, HEIGHT_FLOOR_NOISE * groove.sigma_m)
+    per_station = [sigma, np.hypot(errors["root"], height_floor), depth, smooth["angle"]]
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lines[0], axis=0), axis=1))])
     if groove.closed:
         k = int(np.argmin(np.linalg.norm(lines[0] - target, axis=1)))
@@ -246,9 +171,8 @@ def _finish(
         gaps = [(last - b + first, last - a + first) for a, b in gaps][::-1]
         corner_s = [float(s[-1]) - c for c in corner_s][::-1]
         apexes, ends_seen = apexes[::-1], ends_seen[::-1]
-    curve = SeamCurve.from_points(lines[0], up=R[:, 2])
     return GrooveSeam(
-        curve=curve,
+        curve=SeamCurve.from_points(lines[0], up=R[:, 2]),
         root=lines[0],
         left=lines[1],
         right=lines[2],
@@ -263,9 +187,135 @@ def _finish(
         closed=groove.closed,
         ends_seen=ends_seen,
         start=word,
-        pitch=pitch,
+        pitch=groove.pitch_m,
         face_sigma=groove.sigma_m,
     )
+
+
+def _seen(
+    f: Floats,
+    around: Floats,
+    line: SmoothLine,
+    slices: Slices,
+    groove: CoarseGroove,
+    profile: Profile,
+    config: GrooveConfig,
+) -> tuple[float, float, list[tuple[float, float]], tuple[bool, bool]]:
+    """First and last arc length of the groove, its gaps, and which ends are ends of the plate.
+
+    Raises:
+        GrooveUncertain: too much of it is hidden.
+    """
+    first, last, gaps = measured_extent(f, line, profile, slices, groove)
+    gaps = [_unmeasured(gap, slices) for gap in gaps]
+    ends_seen = (True, True)
+    if groove.closed:
+        first, last = 0.0, line.length
+    else:
+        ends_seen = ends_at_edges(around, (first, last), line, profile, config.ground_reach_m)
+        # The last section at the edge of a shadow is not reliable.
+        first = first if ends_seen[0] else max(first, float(slices.s[1]))
+        last = last if ends_seen[1] else min(last, float(slices.s[-2]))
+    missing = sum(b - a for a, b in gaps)
+    longest = max((b - a for a, b in gaps), default=0.0)
+    if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
+        raise GrooveUncertain(
+            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan"
+            " again from elsewhere."
+        )
+    return first, last, [(a, b) for a, b in gaps if a >= first and b <= last], ends_seen
+
+
+def _smoothed(at: Floats, slices: Slices, width: float) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Return what the sections measured, smoothed at arc lengths (N,), and its sigma (N,), each by name."""
+    sigma, sigma_z = slices.sigma, slices.sigma_height
+    even = np.ones(len(sigma))
+    values = {
+        "centre": (slices.column("centre"), sigma),
+        "root": (slices.column("root"), sigma_z),
+        "angle": (slices.column("angle"), sigma_z),
+        "left": (np.array([x.shoulders[0] - x.centre for x in slices.sections]), sigma),
+        "right": (np.array([x.shoulders[1] - x.centre for x in slices.sections]), sigma),
+        "face_left": (np.array([x.faces[0] for x in slices.sections]), even),
+        "face_right": (np.array([x.faces[1] for x in slices.sections]), even),
+    }
+    smooth: dict[str, Floats] = {}
+    errors: dict[str, Floats] = {}
+    for name, (value, spread) in values.items():
+        own = smoothing_weights(slices.s, slices.s, spread, 2.0 * width)
+        off = (value - own @ value) / (spread * np.sqrt(np.maximum(1.0 - np.diag(own), 0.1)))
+        scale = 1.4826 * float(np.median(np.abs(off)))
+        spread = spread * np.maximum(1.0, np.abs(off) / max(4.0 * scale, 1e-12))
+        W = smoothing_weights(at, slices.s, spread, width)
+        smooth[name] = W @ value
+        errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
+    return smooth, errors
+
+
+def _line_sigma(
+    at: Floats,
+    line: SmoothLine,
+    slices: Slices,
+    groove: CoarseGroove,
+    gaps: list[tuple[float, float]],
+    corners: list[Corner],
+    sigma: Floats,
+    width: float,
+    ends: tuple[float, float],
+) -> Floats:
+    """Return the line's sigma (N,) m at arc lengths (N,): of its sections, over gaps, of one wall, at ends, at corners."""
+    pitch = groove.pitch_m
+    for a, b in gaps:
+        hidden = (at > a) & (at < b)
+        bend = max(line.tightest_bend((a, b)), 2.0)
+        # Sections next to a shadow are few: a bridge is not much better known at its ends than in its middle.
+        lever = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
+        sigma[hidden] += 0.25 * bend * lever
+    # Where one wall was not measured the edge of the face replaces it, with an error common to the whole line.
+    one_walled = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
+    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(one_walled)), width) @ one_walled, 0.0, 1.0)
+    sigma = np.hypot(sigma, math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
+    sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
+    if not groove.closed:
+        # The last sections have neighbours on one side only, and contain points of the plate's edge.
+        sigma = np.hypot(sigma, END_PITCHES * pitch * np.exp(-np.minimum(at - ends[0], ends[1] - at) / END_REACH_M))
+    for corner in corners:
+        reach = max(corner.blind, corner.radius, CORNER_REACH_M)
+        sigma = np.hypot(sigma, corner.sigma * np.exp(-0.5 * np.square((at - corner.s) / reach)))
+    return sigma
+
+
+def _refuse_uncertain(
+    at: Floats,
+    sigma: Floats,
+    gaps: list[tuple[float, float]],
+    corners: list[Corner],
+    groove: CoarseGroove,
+    config: GrooveConfig,
+) -> None:
+    """Raise GrooveUncertain where a corner, the seen line or a hidden bend is not known well enough."""
+    scan = f"from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * groove.pitch_m:.1f} mm apart)"
+    hidden = np.zeros(len(at), dtype=bool)
+    for a, b in gaps:
+        hidden |= (at > a) & (at < b)
+    for corner in corners:
+        if corner.sigma > config.most_bridge_sigma_m:
+            raise GrooveUncertain(
+                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f}"
+                f" mm {scan}. Use a finer scanner or move it nearer."
+            )
+    mean = math.sqrt(np.mean(np.square(sigma[~hidden])))
+    if mean > config.most_sigma_m:
+        raise GrooveUncertain(
+            f"The groove's root is only known to {1e3 * mean:.2f} mm {scan} and"
+            f" {1e3 * config.most_sigma_m:.2f} mm are required. Use a finer scanner or move it nearer."
+        )
+    if np.max(sigma[hidden], initial=0.0) > config.most_bridge_sigma_m:
+        longest = max(b - a for a, b in gaps)
+        raise GrooveUncertain(
+            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its line there is only known to "
+            f"{1e3 * np.max(sigma[hidden]):.1f} mm: clear the view or scan again from elsewhere."
+        )
 
 
 def _unmeasured(gap: tuple[float, float], slices: Slices) -> tuple[float, float]:
