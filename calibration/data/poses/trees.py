@@ -166,8 +166,7 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
         return
     flat = _flat(node)
     columns, _ = columns_of(list(flat))
-    direct = [n for n in flat if len({c.prefix for c in columns}) <= 1 or not columns]
-    if len(columns) >= 6 and direct and len({c.prefix for c in columns}) == 1:
+    if len(columns) >= 6 and len({c.prefix for c in columns}) == 1:
         roots = {list(flat)[c.index].partition(".")[0] for c in columns}
         beside = {
             k: v for k, v in node.items() if str(k).lower() not in roots and isinstance(v, Mapping | list | np.ndarray)
