@@ -1,23 +1,21 @@
 """Jumps, creeps and quiet hours of a monitored calibration, on a world of features."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import ncx2
 
-from tests.figures.harness import Cases, Figures, Results, Row, Study, Target, all_met, whole
+from tests.figures.harness import Run, figure
 from tests.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter
 from weldcal.calibration.motion.drift.residuals import CLOCK
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
+from weldcal.tools.report.render import fixed, statistics
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0
@@ -49,123 +47,41 @@ class DriftTrial:
     named: str = ""
 
 
-def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapping[str, object]:
-    """Watch one recording: a ``kind`` of change as a Trial, or "quiet" hours in which nothing happens."""
-    world = WorldConfig(stamps=stamps)
-    if kind != "quiet":
-        return asdict(creep_trial(world, seed) if kind == "creep" else knock_trial(world, seed, turn=kind == "turn"))
-    alarmed, largest, threshold = quiet_hours(world, hours, seed)
-    return {
-        "kind": kind,
-        "stamps": stamps,
-        "hours": hours,
-        "largest_statistic": largest,
-        "threshold": threshold,
-        "alarmed": [
-            {
-                "kind": e.kind,
-                "time_s": e.time_s,
-                "found_s": e.found_s,
-                "statistic": e.statistic,
-                "model": e.model,
-                "translation_mm": (1e3 * e.translation_m).tolist(),
-                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
-            }
-            for e in alarmed
-        ],
-    }
-
-
-def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
-    """Return jumps, of which every other one shifts and turns, creeps, and one recording of quiet hours."""
-    kinds = [("turn" if k % 2 else "shift", seed + k) for k in range(knocks)]
-    kinds += [("creep", seed + 5000 + k) for k in range(creeps)]
-    out: dict[str, dict[str, Any]] = {f"{kind} {n}": {"kind": kind, "seed": n, "stamps": stamps} for kind, n in kinds}
-    return out | {"quiet": {"kind": "quiet", "seed": seed + 9000, "stamps": stamps, "hours": hours}}
-
-
-def _figures(results: Results) -> Figures:
-    quiet = whole(results)["quiet"]
-    trials = [DriftTrial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
-    knocks = [t for t in trials if t.kind != "creep"]
-    found = np.array([t.found_after_s for t in knocks])
-    creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
-    reached = 1e3 * CREEP_M_S * np.where(np.isnan(creeps), np.inf, creeps)
-    early, hours = sum(t.false_alarms for t in trials), quiet["hours"]
-    targets = [
-        Target(f"knocks found within {WITHIN_S:g} s", "%", _percent(found <= WITHIN_S), 100.0, "≥"),
-        Target(f"false alarms in {hours:g} quiet hours", "", float(len(quiet["alarmed"])), 0.0),
-        Target("false alarms before a change", "", float(early), 0.0),
-        Target("creep when found", "mm", float(reached.max(initial=0.0)), 1e3 * CREEP_MOST_M, over="worst"),
-    ]
-    return {
-        "state": "done" if all_met(targets) else "failed",
-        "stamps": quiet["stamps"],
-        "knocks": len(knocks),
-        "found_within_2_s": int((found <= WITHIN_S).sum()),
-        "found": int(np.isfinite(found).sum()),
-        "found_after_s": _spread(found),
-        "time_error_s": _spread(np.abs(np.array([t.time_error_s for t in knocks]))),
-        "translation_error_mm": _spread(np.array([t.translation_error_mm for t in knocks if t.kind == "shift"])),
-        "rotation_error_deg": _spread(np.array([t.rotation_error_deg for t in knocks if t.kind == "turn"])),
-        "named_right": sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in knocks),
-        "expected_late": expected_late(knocks),
-        "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
-        "turns_by_angle_to_the_view": found_by_angle(knocks),
-        "creep_mm_when_found": reached.tolist(),
-        "quiet_hours": hours,
-        "false_alarms": len(quiet["alarmed"]),
-        "alarmed": quiet["alarmed"],
-        "largest_statistic": quiet["largest_statistic"],
-        "threshold": quiet["threshold"],
-        "targets": [{**t._asdict(), "met": t.met} for t in targets],
-    }
-
-
-def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a trial's fields; JSON has null for NaN."""
-    return {name: float("nan") if value is None else value for name, value in result.items()}
-
-
-def _targets(figures: Figures) -> list[Target]:
-    return [Target(**{name: t[name] for name in Target._fields}) for t in figures["targets"]]
-
-
-def _rows(figures: Figures) -> Iterable[Row]:
-    for r in figures["turns_by_angle_to_the_view"]:
-        found, shown = r["found_within_2_s_percent"], r["shown_median"]
-        yield f"{r['from_deg']:g} to {r['to_deg']:g}", f"{r['turns']}", f"{found:.0f}", f"{shown:.3g}"
-
-
-STUDY = Study(
-    name="drift",
-    what=(
-        "How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet"
-        " hours."
-    ),
-    case=one_recording,
-    figures=_figures,
-    header=("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds"),
-    rows=_rows,
-    targets=_targets,
-    numbers=3,
-)
-
-
-@command("benchmark drift", short_help="Measure how soon a moved scanner is found.", options=FARM, hidden=True)
-def benchmark_drift(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
-    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
-    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
-    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
-    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
-) -> Outcome:
-    """Measure the drift test: how soon jumps of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
-    if stamps not in ("device", "arrival"):
-        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
-    size = (2, 1, 0.01) if quick else (runs, creeps, hours)
-    return STUDY.outcome(call, cases(*size, stamps, call.seed))
+@figure("drift", "how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms in quiet hours")
+def drift(run: Run) -> None:
+    """Measure the drift test on a world of features."""
+    (knocks, creeps, hours), world = run.size((2, 1, 0.01), (200, 8, 10.0)), WorldConfig()
+    trials = []
+    for k in range(knocks):
+        run.progress("knocks", k / knocks)
+        trials.append(knock_trial(world, run.seed + k, turn=bool(k % 2)))
+    found = np.array([t.found_after_s for t in trials])
+    slow = [creep_trial(world, run.seed + 5000 + k) for k in range(creeps)]
+    reached = 1e3 * CREEP_M_S * np.array([t.found_after_s for t in slow])
+    alarmed, largest, threshold = quiet_hours(world, hours, run.seed + 9000)
+    right = sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in trials)
+    shifts = [t.translation_error_mm for t in trials if t.kind == "shift"]
+    turns = [t.rotation_error_deg for t in trials if t.kind == "turn"]
+    rows = (
+        (f"knocks found within {WITHIN_S:g} s", f"{(found <= WITHIN_S).sum()} of {knocks}"),
+        ("late by noise alone, expected", f"{expected_late(trials):.2f}"),
+        ("knocks named right", f"{right} of {knocks}"),
+        ("found after, s: median, 95 %, worst", _spread(found)),
+        ("time off, s", _spread(np.abs([t.time_error_s for t in trials]))),
+        ("shift off, mm", _spread(np.array(shifts))),
+        ("turn off, deg", _spread(np.array(turns))),
+        ("creep when found, mm", _spread(reached)),
+        (f"false alarms in {hours:g} quiet hours", str(len(alarmed))),
+        ("false alarms before a change", str(sum(t.false_alarms for t in (*trials, *slow)))),
+        ("largest statistic in quiet hours, of its threshold", f"{largest / threshold:.2f}"),
+    )
+    run.table("", ("", "found"), rows)
+    by_angle = (
+        (f"{r['from_deg']:g} to {r['to_deg']:g}", f"{r['turns']}", f"{r['found_percent']:.0f}", f"{r['shown']:.3g}")
+        for r in found_by_angle(trials)
+    )
+    header = ("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds")
+    run.table("", header, by_angle)
 
 
 def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
@@ -295,16 +211,8 @@ def found_by_angle(trials: Sequence[DriftTrial]) -> list[dict[str, float]]:
         part = [t for t, a in zip(turns, angles, strict=True) if low <= a < high or a == high == 90.0]
         if part:
             found = np.array([t.found_after_s for t in part])
-            rows.append(
-                {
-                    "from_deg": low,
-                    "to_deg": high,
-                    "turns": len(part),
-                    "found_within_2_s_percent": _percent(found <= WITHIN_S),
-                    "shown_median": float(np.median([t.shown for t in part])),
-                    "shown_least": float(min(t.shown for t in part)),
-                }
-            )
+            shown, hits = float(np.median([t.shown for t in part])), 100.0 * float(np.mean(found <= WITHIN_S))
+            rows.append({"from_deg": low, "to_deg": high, "turns": len(part), "found_percent": hits, "shown": shown})
     return rows
 
 
@@ -333,12 +241,5 @@ def _trial(
     return missed
 
 
-def _percent(hits: NDArray[np.bool_]) -> float:
-    return 100.0 * float(np.mean(hits)) if len(hits) else float("nan")
-
-
-def _spread(values: Array) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return {}
-    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95.0)), "worst": float(known.max())}
+def _spread(values: Array) -> str:
+    return ", ".join(fixed(v, 4) for v in statistics(values, "median", "p95", "max").values())

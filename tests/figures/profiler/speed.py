@@ -1,21 +1,17 @@
 """Times the calibration of a profiler by an edge without a guess, and by the paper's method."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.figures.harness import Figures, Row, Study
-from tests.figures.profiler.seeds import profiler_seeds
-from tests.figures.subject import one_of
+from tests.figures.harness import Run, figure
 from tests.worlds.edge_trials import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import fixed
 
@@ -25,32 +21,21 @@ SAME_DEG, SAME_MM = 0.01, 0.01  # from the optimum that a start at the truth lea
 Answer = tuple[Floats, Floats]
 
 
-@command("benchmark profiler-speed", short_help="Time the profiler's calibration by an edge.", hidden=True)
-def benchmark_speed(
-    call: Call,
-    data: Annotated[
-        Path | None, option("--data", "FOLDER", "The fixed files. Without them, sets generated from the seed.")
-    ] = None,
-) -> Outcome:
-    """Time the profiler's calibration by an edge and compare it with the published method."""
-    folder = SPEED.folder(call)
-    return SPEED.found(time_methods(call.seed, data, call.progress), folder)
+@figure("profiler-speed", "time of a profiler's calibration by an edge without a guess, and by the paper's method")
+def profiler_speed(run: Run) -> None:
+    """Time both methods on the same sets."""
+    rows = []
+    for r in time_methods(run.seed, run.data, run.size(4, SETS), run.progress):
+        times = (f"{1e3 * r[key]:.1f}" for key in ("median_s", "most_s", "processor_s", "most_processor_s"))
+        found = "" if r["found"] is None else f"{r['found']} of {r['sets']}"
+        off = (fixed(r["rotation_deg"], 3), fixed(r["translation_mm"], 3))
+        rows.append((r["method"], r["poses"], *times, found, *off))
+    times_of = ("median ms", "most ms", "processor ms", "most ms")
+    run.table("", ("method", "poses", *times_of, "optimum found", "off deg", "off mm"), rows)
 
 
-@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.", options=FARM)
-@one_of("speed", speed=benchmark_speed, seeds=profiler_seeds)
-def benchmark_profiler(call: Call) -> None:
-    """Time the profiler's calibration by an edge, or run every target of 'reproduce profiler' over many seeds."""
-
-
-def time_methods(seed: int, data: Path | None, progress: Progress) -> dict[str, object]:
-    """Time them in one run on the same sets.
-
-    Raises:
-        InputError: the fixed files are not in the folder named.
-    """
-    if data is not None and not data.is_dir():
-        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz.")
+def time_methods(seed: int, data: Path | None, count: int, progress: Progress) -> list[dict[str, Any]]:
+    """Time them in one run on ``count`` sets, of the folder or made from the seed."""
 
     def sets(name: str, count: int) -> list[EdgeTrial]:
         every = made_edge_trials(name, count, seed) if data is None else fixed_edge_trials(data, name)
@@ -58,31 +43,15 @@ def time_methods(seed: int, data: Path | None, progress: Progress) -> dict[str, 
 
     rows: list[dict[str, Any]] = []
     for k, level in enumerate(("paper", "nominal")):
-        free = sets(f"free_{level}", SETS)
+        free = sets(f"free_{level}", count)
         progress(f"40 free poses, {level} noise", 0.15 * k)
         best = [_from_truth(t) for t in free]
         rows.append(_row("joint, no guess", f"40 free, {level} noise", free, _joint, best))
-    arcs = sets("tilt_paper", 10)
+    arcs = sets("tilt_paper", (count + 1) // 2)
     progress("the paper's method", 0.8)
     rows.append(_row("joint, no guess", "25 x 10, paper noise", arcs, _joint, [_from_truth(t) for t in arcs]))
     rows.append(_row("paper, centred", "25 x 10, paper noise", arcs, _paper, None))
-    return {"data": "fixed files" if data is not None else f"seed {seed}", "rows": rows}
-
-
-def _lines(figures: Figures) -> Iterable[Row]:
-    for r in figures["rows"]:
-        times = (f"{1e3 * r[key]:.1f}" for key in ("median_s", "most_s", "processor_s", "most_processor_s"))
-        found = "" if r["found"] is None else f"{r['found']} of {r['sets']}"
-        yield r["method"], r["poses"], *times, found, fixed(r["rotation_deg"], 3), fixed(r["translation_mm"], 3)
-
-
-SPEED = Study(
-    name="profiler",
-    what="Time of a profiler's calibration by an edge without a guess, and by the paper's method.",
-    header=("method", "poses", "median ms", "most ms", "processor ms", "most ms", "optimum found", "off deg", "off mm"),
-    rows=_lines,
-    numbers=7,
-)
+    return rows
 
 
 def _row(
