@@ -12,7 +12,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.figures.harness import Run
-from tests.figures.weld.rows import ROWS, CaseResult, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
+from tests.figures.weld.rows import ROWS, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
 from tests.figures.weld.study import study
 from tests.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, WeldUnknowns, draw_world, planned_seam, roughness
 from tests.worlds.weld.case import RunMetrics, WeldCase, run_case, study_config
@@ -176,12 +176,11 @@ def test_figures_that_a_run_lacks_count_as_missed() -> None:
         RunMetrics(completed=False, phase="FAULT", reason="why", reached_mm=20.0),
     )
     target = MetricTarget("max_mm", 0.15)
-    assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
-    both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])
+    assert hold_against(target, {case: {0: good}}).met
+    both = hold_against(target, {case: {0: good, 1: broken}})
     assert not both.met
     assert both.worst_run.endswith("seed 1")
-    mean = hold_against(MetricTarget("max_mm", 0.15, "mean"), [CaseResult(case, (0, 1), (good, good))])
-    assert mean.value == pytest.approx(0.1)
+    assert hold_against(MetricTarget("max_mm", 0.15, "mean"), {case: {0: good, 1: good}}).mean == pytest.approx(0.1)
 
 
 def test_rows_and_seams_are_named_when_unknown() -> None:

@@ -10,7 +10,7 @@ from tests.figures.harness import Run, figure
 from tests.worlds.flange_frames import FlangeScan, facing, flange_frame
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.arrays import Array
-from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
+from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import fixed
@@ -26,11 +26,8 @@ Timing = dict[str, Any]
 found nothing)."""
 
 
-def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
-    """Time every method on the same simulated PhoXi M scans; on one thread where its library allows that.
-
-    ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
-    """
+def run_flange_benchmark(seed: int = 0, progress: Progress = no_progress) -> list[Timing]:
+    """Time every method on the same simulated PhoXi M scans; on one thread where its library allows that."""
     standard = get_flange(FLANGE)
     frames: dict[str, FlangeScan] = {}
     for name, width in (("0.5", 824), ("3.2", 2064)):
@@ -53,11 +50,6 @@ def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress
     for k, (name, job) in enumerate(ours):
         progress("ours", 0.1 + 0.08 * k)
         rows.append(_time(f"weldcal, {name}", job, _REPEATS, truth))
-    if loop:
-        progress("the paper's loop", 0.8)
-        rows.append(
-            _time("paper's search as a Python loop, segmented cloud", lambda: _paper_loop(cloud, seed), 1, truth)
-        )
     return rows
 
 
@@ -85,42 +77,10 @@ def _segmented(frame: FlangeScan, outer_m: float) -> tuple[Array, Array]:
     return p[keep], np.asarray(frame.X_CR.translation())
 
 
-def _circle(a: Array, b: Array, c: Array) -> tuple[Array, float]:
-    """Circle through three points in space."""
-    u, v = b - a, c - a
-    w = np.cross(u, v)
-    ww = float(w @ w)
-    if ww < 1e-18:
-        return a, np.inf
-    out = (np.cross(w, u) * float(v @ v) + np.cross(v, w) * float(u @ u)) / (2.0 * ww)
-    return a + out, float(np.linalg.norm(out))
-
-
-def _paper_loop(points: Array, seed: int) -> Array | None:
-    """Section 2.1.4 as the paper's Python program does it: of circles through three points the one with most points.
-
-    Circles of another radius are left out; points are counted one by one.
-    """
-    rng, everything = np.random.default_rng(seed), points.tolist()
-    best, most = None, 0
-    for _ in range(_K_MAX):
-        center, radius = _circle(*points[rng.integers(0, len(points), 3)])
-        if abs(radius - PAPER_RADIUS_M) > _E_R:
-            continue
-        x, y, z = center.tolist()
-        agree = 0
-        for px, py, pz in everything:
-            if abs(((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) ** 0.5 - radius) < _E_D:
-                agree += 1
-        if agree > most:
-            best, most = center, agree
-    return best
-
-
-@figure("flange-speed", "processor time to find the flange in a scan, beside the paper's loop")
+@figure("flange-speed", "processor time to find the flange in a scan")
 def speed(run: Run) -> None:
-    """Time the detection of the flange in a scan, with the paper's loop in the full form."""
-    rows = run_flange_benchmark(run.seed, loop=run.full, progress=run.progress)
+    """Time the detection of the flange in a scan."""
+    rows = run_flange_benchmark(run.seed, run.progress)
     ours = rows[0]["median_ms"]
     lines = (
         (

@@ -17,15 +17,7 @@ from tests.worlds.tablet import (
     published_touches,
     simulate_trial,
 )
-from weldcal.calibration.tablet.planar_fit import (
-    PlanarConfig,
-    fit_linear,
-    fit_planar,
-    fit_plane_motion,
-    hand_over,
-    solve_closed_form,
-    touched_rays,
-)
+from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, fit_plane_motion, hand_over
 from weldcal.calibration.tablet.published import (
     PUBLISHED_EVALUATIONS,
     PUBLISHED_POPULATION,
@@ -43,7 +35,6 @@ from weldcal.calibration.tablet.published import (
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
-from weldcal.tools.console import Progress
 from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
 from weldcal.tools.report.render import fixed
 
@@ -257,40 +248,6 @@ def held_out(seed: int, trials: int, published_trials: int) -> tuple[HeldOutRow,
 def _held_out_row(name: str, trials: list[TabletTrial], asked: Callable[[TabletTrial], Array]) -> HeldOutRow:
     errors = [np.linalg.norm(asked(t) - t.query_hand_m, axis=1).mean() for t in trials]
     return HeldOutRow(name, len(trials), 1e3 * float(np.mean(errors)))
-
-
-@figure("tablet-speed", "the time of each tablet calibration beside the published search")
-def tablet_speed(run: Run) -> None:
-    """Time every calibration on the published data."""
-    run.table("", ("figure", "found"), ((name, f"{value:.4g}") for name, value in times(run.progress).items()))
-
-
-def times(progress: Progress) -> dict[str, float]:
-    """Time every calibration on the published data."""
-    touches = published_touches()
-    progress("closed form", 0.0)
-    rays, hand, theta = touched_rays(touches).T.copy(), touches.hand_m.T.copy(), touches.theta_rad
-    closed = median_seconds(lambda: solve_closed_form(rays, hand, theta), 5000)
-    progress("PnP", 0.3)
-    config = PlanarConfig(free_scale=True)
-    planar = median_seconds(lambda: fit_planar(touches, config, leave_one_out=False), 100)
-    progress("two stages", 0.5)
-    stage1 = tablet_stage1(touches)
-    two_stages = median_seconds(lambda: tablet_stage2(touches, tablet_stage1(touches).parameters), 3)
-    alone, crowd = evaluation_seconds(touches)
-    published = PUBLISHED_EVALUATIONS * alone
-    return {
-        "closed_form_us": 1e6 * closed,
-        "pnp_us": 1e6 * planar,
-        "two_stages_s": two_stages,
-        "stage_1_evaluations": stage1.evaluations,
-        "evaluation_us": 1e6 * alone,
-        "evaluation_in_crowd_us": 1e6 * crowd,
-        "published_search_extrapolated_s": published,
-        "published_search_in_crowds_extrapolated_s": PUBLISHED_EVALUATIONS * crowd,
-        "closed_form_times_faster": published / closed,
-        "two_stages_times_faster": 2.0 * published / two_stages,
-    }
 
 
 PUBLISHED_TRIALS = 20
