@@ -207,6 +207,8 @@ def flange(run: Run) -> None:
     """Repeat the flange paper; without --data only the simulated parts."""
     found = compute(run.data, run.seed, not run.full, run.progress)
     run.table("The effect of Algorithm 1's cost (simulated, 1 mm of noise)", COST_HEADER, cost_rows(found))
+    ratio = "  ".join(f"{v:.1f}" for v in found.simulation.ratio)
+    run.say(f"Fig. 9: spread of all pairs over that of Algorithm 1, roll pitch yaw x y z: {ratio}\n")
     for title, header, rows in tables(found):
         run.table(title, header, rows)
     for name, draw in pictures(found).items():

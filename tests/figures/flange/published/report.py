@@ -234,6 +234,7 @@ COST_HEADER = ("chosen by", *_SIX, "true mm", "worst mm")
 HELD_HEADER = ("calibration", "reported mm", "median mm", "mean mm", "95 % mm", "true / reported")
 KINECT_HEADER = ("calibration", "median mm", "mean mm", "95 % mm")
 SIGHT_HEADER = ("registration", "tilt x", "tilt y", "turn", "in x", "in y", "normal", "reports mm", "unobservable")
+CIRCLE_HEADER = ("repeats", "off in x", "y", "z", "two halves apart", "the same by weldcal's edges")
 SHORT = {
     "rotation about the flange axis": "turn",
     "in the flange plane, x": "plane x",
@@ -324,6 +325,7 @@ def tables(study: PublishedResults) -> list[tuple[str, Row, list[Row]]]:
     for c in study.clouds:
         found.append((f"{c.title}: fitted on {c.n_fit} scans, judged on the others", HELD_HEADER, held_out_rows(c)))
         found.append((f"{c.title}: share of a known error that a registration reports", SIGHT_HEADER, sight_rows(c)))
+        found.append((f"{c.title}: centre of the published circle, mm", CIRCLE_HEADER, [c.circle_row]))
     found.append(("Azure Kinect: errors at the wrist ring", KINECT_HEADER, kinect_rows(study)))
     found.append(("Notes", ("data",), [(note,) for note in study.notes]))
     return [table for table in found if table[2]]
