@@ -60,22 +60,26 @@ class Moves:
         return np.array(found, dtype=float)
 
     @property
+    def _peaks(self) -> Array:
+        """The largest speed (n,) m/s of each move: a short one does not reach the speed."""
+        return np.minimum(self.speed, np.sqrt(self.acceleration * self.lengths))
+
+    @property
     def ends_s(self) -> Array:
         """When each move has ended, its pause included (n,) s; the last one closes the loop."""
-        ramp = self.speed / self.acceleration
-        return np.cumsum(ramp + self.lengths / self.speed + self.pause_s)
+        return np.cumsum(self._peaks / self.acceleration + self.lengths / self._peaks + self.pause_s)
 
     def _progress(self, t: Array) -> tuple[np.ndarray, Array]:
         """Which move, and the share 0..1 of it done; at rest before 0."""
-        a, ramp, ends = self.acceleration, self.speed / self.acceleration, self.ends_s
+        a, ends = self.acceleration, self.ends_s
         t = np.mod(np.maximum(t, 0.0), ends[-1])
         k = np.minimum(np.searchsorted(ends, t, side="right"), len(ends) - 1)
-        x = t - np.append(0.0, ends)[k]
-        c = (self.lengths / self.speed - ramp)[k]
-        up = 0.5 * a * np.minimum(x, ramp) ** 2
-        steady = self.speed * np.clip(x - ramp, 0.0, c)
+        x, v, length = t - np.append(0.0, ends)[k], self._peaks[k], self.lengths[k]
+        ramp = v / a
+        c = length / v - ramp
         y = np.clip(x - ramp - c, 0.0, ramp)
-        return k, (up + steady + self.speed * y - 0.5 * a * y**2) / self.lengths[k]
+        up, steady = 0.5 * a * np.minimum(x, ramp) ** 2, v * np.clip(x - ramp, 0.0, c)
+        return k, (up + steady + v * y - 0.5 * a * y**2) / length
 
 
 def closed_moves(way: Array, *, linear: bool, robot: str = ROBOT, fastest: bool = False, **options: float) -> Moves:
