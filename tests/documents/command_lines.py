@@ -52,26 +52,7 @@ SHORT = (
     (r"^demo --scenario my_cell/cell\.yaml", r"demo --scenario short_cell.yaml"),
     (r"^demo (--robot|--record|--seed|--share)", r"demo --scenario short.yaml \1"),
     (r"^demo --scenario wired_s_groove", "demo --scenario short_wired.yaml"),
-    (
-        r"(benchmark part-registration)( --part lap --scenes 3 --plans 1 --refusals 0)?$",
-        r"\1 --part lap --scenes 1 --plans 1 --refusals 0",
-    ),
-    (
-        r"(benchmark seam-planning) --preset phoxi_m --full-resolution --no-troubles",
-        r"\1 --runs 1 --preset phoxi_m --full-resolution --no-troubles",
-    ),
-    (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
-    (r"(benchmark hand-eye --what mountings)( --light)?.* --runs.*", r"\1\2 --runs 1 --scenario eye_on_base"),
-    (r"benchmark robot$", "benchmark robot --minutes 0.2"),
-    (r"(benchmark flange --what live) --seeds 12 --redraws 200", r"\1 --seeds 1 --redraws 5 --scans 4"),
-    (r"(benchmark flange --what honesty) --runs 500", r"\1 --runs 10"),
-    (r"(benchmark flange --what stated)", r"\1 --runs 2"),
-    (r"benchmark seam-planning --runs 5", "benchmark seam-planning --runs 1 --preset phoxi_m --no-troubles"),
-    (r"reproduce flange (\S+)", r"reproduce flange \1 --quick"),
-    (r"reproduce flange-sphere$", "reproduce flange-sphere --scans 20 --draws 3"),
-    (r"reproduce profiler$", "reproduce profiler --quick"),
-    (r"benchmark profiler --what seeds$", "benchmark profiler --what seeds --seeds 2"),
-    (r"reproduce tablet$", "reproduce tablet --trials 4"),
+    (r"^(figures .*?) --full", r"\1"),
 )
 
 

@@ -21,8 +21,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
+import typer
+
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
 
 ROOT = Path(__file__).resolve().parents[2]
 LIST = ROOT / "tests" / "mutations.txt"
@@ -166,23 +167,20 @@ def run_mutations(
                 pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the rest
 
 
-@command("mutate", short_help="Change formulas one by one; tests must fail.", common=LOOK)
 def mutate(
-    call: Call,
-    only: Annotated[str, option("--only", "TEXT", "Mutations whose file or reason holds TEXT.")] = "",
-    jobs: Annotated[int, option("--jobs", "N", "Copies of the project that are tested side by side.", min=1)] = 1,
-) -> Outcome:
-    """Apply each mutation of tests/mutations.txt to a copy of the project and run its closest tests, which must
-    fail."""
+    only: Annotated[str, typer.Option("--only", help="Mutations whose file or reason holds this.")] = "",
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Copies of the project tested side by side.")] = 1,
+) -> None:
+    """Apply each mutation of tests/mutations.txt to a copy of the project and run its closest tests: they must fail."""
     chosen = [m for m in read_mutations(LIST.read_text()) if only in f"{m.file} {m.reason}"]
-    if not chosen:
-        raise InputError(f"No mutation's file or reason holds '{only}'; see {LIST}.")
-    found = {mutation: (verdict, said) for mutation, verdict, said in run_mutations(chosen, jobs, call.progress)}
-    count = Counter(verdict for verdict, _ in found.values())
-    bad = [m.reason for m in chosen if found[m][0] == ERROR or (found[m][0] == SURVIVED and not m.why)]
-    lines = [f"{found[m][0]:9} {m.file}: {m.reason} ({m.why or found[m][1]})" for m in chosen]
-    share = count[KILLED] / len(chosen)
-    total = f"{count[KILLED]} of {len(chosen)} killed ({share:.1%}), {count[SURVIVED]} survived, {count[ERROR]} errors"
-    reason = f"{len(bad)} mutations survive without a reason, the first: {bad[0]}." if bad else None
-    summary = {"state": "failed" if bad else "done", "reason": reason, "killed_share": share, **count}
-    return Outcome(summary | {"mutations": {m.reason: list(found[m]) for m in chosen}}, text="\n".join([*lines, total]))
+    count: Counter[str] = Counter()
+    bad = []
+    for m, verdict, said in run_mutations(chosen, jobs, lambda stage, share: None):
+        print(f"{verdict:9} {m.file}: {m.reason} ({m.why or said})", flush=True)
+        count[verdict] += 1
+        bad += [m.reason] if verdict == ERROR or (verdict == SURVIVED and not m.why) else []
+    print(f"{count[KILLED]} of {len(chosen)} killed, {count[SURVIVED]} survived, {count[ERROR]} errors")
+    if bad or not chosen:
+        why = f"{len(bad)} mutations survive without a reason, the first: {bad[0]}." if bad else f"'{only}' has none."
+        typer.echo(why, err=True)
+        raise typer.Exit(1)

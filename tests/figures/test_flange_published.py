@@ -3,7 +3,6 @@ data."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from typer.testing import CliRunner
 
 from tests.calibration.flange.face import face_points
-from tests.figures.__main__ import app
 from tests.figures.flange.published.clouds import METHODS, study_clouds
-from tests.figures.flange.published.command import find_datasets, title
+from tests.figures.flange.published.command import find_datasets, flange, title
 from tests.figures.flange.published.pairs import (
     PAPER_E_XYZ_MM,
     find_pools,
@@ -35,6 +32,7 @@ from tests.figures.flange.published.simulation import (
     noisy_points,
     simulate,
 )
+from tests.figures.harness import Run
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
@@ -186,21 +184,15 @@ def test_on_scans_without_any_other_error_the_circle_alone_makes_the_difference(
 def test_a_folder_that_is_not_there_or_holds_nothing_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="There is no folder"):
         find_datasets(tmp_path / "nowhere")
-    result = CliRunner().invoke(app, ["reproduce", "flange", str(tmp_path), "--quick", "--json"])
-    assert result.exit_code == 1
-    assert "holds no dataset" in json.loads(result.stdout.strip().splitlines()[-1])["reason"]
+    with pytest.raises(InputError, match="holds no dataset"):
+        flange(Run(data=tmp_path, out=tmp_path / "o"))
 
 
 def test_without_data_the_simulated_parts_are_reported(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["reproduce", "flange", "--quick", "--json", "--out", str(tmp_path / "o")])
-    assert result.exit_code == 0
-    found = json.loads(result.stdout.strip().splitlines()[-1])
-    assert found["pairs"] == {}
-    assert any("only the simulated parts" in note for note in found["notes"])
-    table = (tmp_path / "o/table.md").read_text()
-    assert "No data folder was given" in table
-    assert "only the simulated" in table
-    assert {p.name for p in (tmp_path / "o/figures").iterdir()} == {"costs.svg", "fig9_noise.svg", "fig10_steps.svg"}
+    run = Run(out=tmp_path)
+    flange(run)
+    assert "No data folder was given: only the simulated" in run.text[-1]
+    assert {p.name for p in tmp_path.iterdir()} == {"costs.svg", "fig9_noise.svg", "fig10_steps.svg"}
 
 
 def test_table_1_names_pairs_that_hold_no_stored_runs() -> None:

@@ -6,36 +6,33 @@ import pytest
 from scipy.stats import binom
 
 from tests.figures.flange.coverage import study_coverage
-from tests.figures.flange.scans import FRAMES, HIDDEN, fit_one, frame_cases, hidden_cases
+from tests.figures.flange.scans import FLANGE, HALF_MPX, counted, fit_one
 from tests.worlds.flange_frames import WAYS
 from tests.worlds.light_runs import study_light_runs
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
 
-ISO_50 = "iso9409-1-50-4-m6"
-HALF_MPX = 824
-
 
 def test_found_in_every_frame_that_shows_it_and_in_none_that_does_not() -> None:
-    study = FRAMES.here(frame_cases(12, 8, 3, HALF_MPX)).figures
-    assert (study["found"], study["mistaken"], study["imagined"]) == (12, 0, 0)
+    study = counted("whole", [fit_one(HALF_MPX, FLANGE, (3, k), "whole") for k in range(12)])
+    assert (study["found"], study["mistaken"]) == (12, 0)
     # 0.07 mm rms over 500 frames; of 12, chi-square with 24 degrees of freedom allows 1.4 times that at 99.9 %
-    assert study["centre_rms_mm"] < 0.1
+    assert study["rms_mm"] < 0.1
+    assert counted("empty", [fit_one(HALF_MPX, FLANGE, (3, 1, k), "empty") for k in range(8)])["imagined"] == 0
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_flange_half_hidden_is_found_whatever_hides_it(way: str) -> None:
-    found = {name: fit_one(**case) for name, case in hidden_cases(4, 0.5, 2, HALF_MPX, ways=(way,)).items()}
-    assert [f["reason"] for f in found.values()] == [None] * 4
-    assert all(f["coverage"] < 0.6 for f in found.values())
+    found = [fit_one(HALF_MPX, FLANGE, (2, k), way) for k in range(4)]
+    assert [f["reason"] for f in found] == [None] * 4
+    assert all(f["coverage"] < 0.6 for f in found)
     # 0.13 mm rms over 30 frames each; of 4, chi-square with 8 degrees of freedom allows 1.8 times that at 99.9 %
-    assert HIDDEN.measured(found).figures["rows"][0]["centre_rms_mm"] < 0.24
+    assert counted(way, found)["rms_mm"] < 0.24
 
 
 @pytest.mark.parametrize("name", ["iso9409-1-80-6-m8", "wrist-ring-90"])
 def test_half_of_a_larger_one_is_found_as_well(name: str) -> None:
-    (row,) = HIDDEN.here(hidden_cases(2, 0.5, 4, HALF_MPX, name, ("plate",))).figures["rows"]
-    assert row["missed"] == []
+    assert [fit_one(HALF_MPX, name, (4, k), "plate")["reason"] for k in range(2)] == [None] * 2
 
 
 def test_the_stated_region_of_a_calibration_holds_the_truth_as_often_as_it_says() -> None:

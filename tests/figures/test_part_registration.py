@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
 from tests.figures.parts import registration
-from tests.figures.parts.registration import NEES_BOUND, run_registration_study
+from tests.figures.parts.registration import NEES_BOUND
 from tests.worlds.parts.scans import REFUSALS, scan_scene, subject
 from weldcal.models.scanners import get_scanner
 from weldcal.welding.locate.part.result import PartRegistration
@@ -18,17 +15,16 @@ from weldcal.welding.locate.part.result import PartRegistration
 pytest.importorskip("OCP")
 
 
-def test_a_scene_is_registered_and_scored_against_its_truth(tmp_path: Path) -> None:
-    found = run_registration_study(tmp_path, range(28, 29), range(0), range(0), ["bracket"])
-    assert found["state"] == "done"
-    assert found["clutter"]["scenes"] == found["clutter"]["right"] == 1  # type: ignore[index]
-    row = next(csv.DictReader((tmp_path / "registrations.csv").open()))
+def test_a_scene_is_registered_and_scored_against_its_truth() -> None:
+    (trial,) = [t for t in registration.clutter_trials([28]) if t[1] == "bracket"]
+    row = registration.run(*trial)
     assert (row["part"], row["verdict"]) == ("bracket", "right")
-    assert 0.0 < float(row["seam_max_mm"]) < 0.3
-    assert float(row["nees"]) < NEES_BOUND
+    assert 0.0 < row["seam_max_mm"] < 0.3
+    assert row["nees"] < NEES_BOUND
+    assert registration.summed([row])["clutter"]["right"] == 1
 
 
-def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     """The truth judges: a pose 1 mm off that claims 0.1 mm is wrong, though it says the best of itself."""
 
     def confident(cloud: object, mesh: object, seam: object, *_: object, **__: object) -> object:
@@ -47,8 +43,8 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
         return said, type("Joint", (), {"seam": part.seam, "share": 1.0})
 
     monkeypatch.setattr(registration, "locate_part", confident)
-    found = run_registration_study(tmp_path, range(0), range(1), range(0), ["lap"])
-    assert (found["state"], found["plan"]["wrong"]) == ("held", 1)  # type: ignore[index]
+    (trial,) = registration.plan_trials([0], ["lap"])
+    assert registration.summed([registration.run(*trial)])["plan"]["wrong"] == 1
 
 
 def test_subjects_must_be_refused_for_the_right_reason(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tests.figures.__main__ import app
-from tests.figures.parts.welds import COLUMNS, _summed, run_part_welds
+from tests.figures.parts.welds import COLUMNS
 from tests.worlds.parts.cells import PartTrial, write_cell
 from tests.worlds.parts.step_parts import PARTS
 from weldcal.models.errors import InputError
@@ -47,9 +45,10 @@ def test_without_it_the_scanners_pose_is_given(tmp_path: Path) -> None:
     assert scenario.calibration.refine == "none"
 
 
-def test_another_refinement_is_refused_before_any_work(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"calibration.refine must be .*, not 'wrists'"):
-        run_part_welds(tmp_path, ["straight_web"], range(1), PartTrial(refine="wrists"))
+@pytest.mark.parametrize("word", ["wrists", "all"])
+def test_another_refinement_is_refused_before_any_work(word: str) -> None:
+    with pytest.raises(InputError, match=f"must be .*, not '{word}'"):
+        PartTrial.of("scan", refine=word)
 
 
 def of_plan(sigma_m: float, refinement: Refinement | None = None) -> DemoResult:
@@ -73,13 +72,6 @@ def test_a_bent_seam_is_noted_where_the_arm_matters() -> None:
     assert "Calibrate" not in note
 
 
-def test_an_unknown_refinement_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    found = CliRunner().invoke(app, ["benchmark", "part-welds", "--refine", "all", "--out", str(tmp_path / "out")])
-    assert found.exit_code == 1
-    assert "--refine must be none, joints or links, not 'all'." in " ".join(found.output.split())
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_seams_figures_name_its_ends() -> None:
     """3-4-5 at the start, 5-12-13 at the end, 0.1 mm between."""
     s = np.arange(0.0, 0.051, 0.001)
@@ -90,22 +82,6 @@ def test_a_seams_figures_name_its_ends() -> None:
     assert {key: found[key] for key in ends} == pytest.approx(ends)
     assert found["torch_max_mm"] == pytest.approx(0.5)
     assert set(ends) - {"torch_middle_max_mm"} <= set(COLUMNS)
-
-
-def test_the_worst_end_of_all_welds_is_given() -> None:
-    """Of three welds: one good, one with a bad last stretch, one that was held before the arc."""
-    good = {
-        "state": "done",
-        "torch_mean_mm": 0.05,
-        "torch_max_mm": 0.12,
-        "torch_first_max_mm": 0.12,
-        "torch_last_max_mm": 0.03,
-    }
-    bad = {**good, "torch_last_max_mm": 0.45, "torch_max_mm": 0.45}
-    found = _summed([good, bad, {"state": "held", "reason": "no room"}])
-    assert (found["state"], found["welds"], found["within_targets"]) == ("held", 3, 1)
-    assert (found["worst_ends_mm"], found["worst_torch_max_mm"], found["worst_torch_mean_mm"]) == (0.45, 0.45, 0.05)
-    assert _summed([{"state": "held"}])["worst_ends_mm"] is None
 
 
 def test_the_arm_of_the_cell_follows_the_bent_web_without_meeting_itself(tmp_path: Path) -> None:

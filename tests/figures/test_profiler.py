@@ -3,13 +3,13 @@ not."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tests.figures.__main__ import app
+from tests.figures.harness import Missed, Run
 from tests.figures.profiler import reproduce
 from tests.figures.profiler.papers import SPHERE_METHODS, edge_rows, measure
 from tests.figures.profiler.reproduce import compute, figure_text, fixed_lines
@@ -72,14 +72,14 @@ def test_everything_random_follows_from_the_seed() -> None:
     assert not np.allclose(one.data.profiles[5], other.data.profiles[5])
 
 
-@pytest.mark.parametrize(("data", "code"), [([], 0), (["--data", "fixed"], 1)])
+@pytest.mark.parametrize("data", [None, Path("fixed")])
 def test_targets_of_the_fixed_files_do_not_decide_on_other_worlds(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, data: list[str], code: int
+    monkeypatch: pytest.MonkeyPatch, data: Path | None
 ) -> None:
-    missed = {"what": "frustum, length", "unit": "mm", "reached": 0.053, "target": 0.042, "verdict": "MISSED"}
-    figures = {"data": "fixed files" if data else "seed 0", "targets": [missed], "edge": [], "sphere": []}
-    monkeypatch.setattr(reproduce, "compute", lambda *_: figures)
+    missed = reproduce.Target("frustum, length", "mm", 0.053, 0.042)
+    monkeypatch.setattr(reproduce, "compute", lambda *_: ([missed], [], []))
     monkeypatch.setattr(reproduce, "_sphere_tables", lambda results: [])
-    found = CliRunner().invoke(app, ["reproduce", "profiler", *data, "--out", str(tmp_path / "out")])
-    assert found.exit_code == code, found.output
-    assert "MISSED" in found.output
+    run = Run(data=data)
+    with nullcontext() if data is None else pytest.raises(Missed, match="1 targets"):
+        reproduce.profiler(run)
+    assert "MISSED" in run.text[0]

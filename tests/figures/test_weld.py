@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from dataclasses import fields
 from pathlib import Path
@@ -11,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from typer.testing import CliRunner
 
-from tests.figures.__main__ import app
-from tests.figures.weld.rows import ROWS, CaseResult, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
+from tests.figures.harness import Run
+from tests.figures.weld.rows import ROWS, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
+from tests.figures.weld.study import study
 from tests.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, WeldUnknowns, draw_world, planned_seam, roughness
 from tests.worlds.weld.case import RunMetrics, WeldCase, run_case, study_config
 from tests.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, TipPlace
@@ -177,12 +176,11 @@ def test_figures_that_a_run_lacks_count_as_missed() -> None:
         RunMetrics(completed=False, phase="FAULT", reason="why", reached_mm=20.0),
     )
     target = MetricTarget("max_mm", 0.15)
-    assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
-    both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])
+    assert hold_against(target, {case: {0: good}}).met
+    both = hold_against(target, {case: {0: good, 1: broken}})
     assert not both.met
     assert both.worst_run.endswith("seed 1")
-    mean = hold_against(MetricTarget("max_mm", 0.15, "mean"), [CaseResult(case, (0, 1), (good, good))])
-    assert mean.value == pytest.approx(0.1)
+    assert hold_against(MetricTarget("max_mm", 0.15, "mean"), {case: {0: good, 1: good}}).mean == pytest.approx(0.1)
 
 
 def test_rows_and_seams_are_named_when_unknown() -> None:
@@ -237,34 +235,14 @@ def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end(
     assert DRAWN.floor(20.0 * MM) == (DROP_M, 0.0)
 
 
-def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
-    out = tmp_path / "study"
-    answer = CliRunner().invoke(
-        app, ["reproduce", "weld", "--rows", "r1_convex", "--seeds", "1", "--out", str(out), "--json"]
-    )
-    assert answer.exit_code == 0, answer.output
-    told = json.loads(answer.stdout.strip().splitlines()[-1])
-    written = json.loads((out / "summary.json").read_text())
+def test_the_figure_prints_its_row_and_draws_its_seam(tmp_path: Path) -> None:
+    run = Run(out=tmp_path)
     # A sharp convex corner is put back from its two sides, within the target of its row.
-    assert told["rows"]["r1_convex"]["completed"] == 1
-    assert told["rows"]["r1_convex"]["met"]
-    assert written["rows"]["r1_convex"]["figures"]["max_mm"]["target"] == 0.50
-    with (out / "runs.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["case"] for row in rows] == ["l_r1_convex-d60-nominal"]
-    assert max(float(row["max_mm"]) for row in rows) == pytest.approx(
-        told["rows"]["r1_convex"]["figures"]["max_mm"]["worst"]
-    )
-    with (out / "runs" / "l_r1_convex-d60-nominal.csv").open() as file:
-        ticks = list(csv.DictReader(file))
-    assert {tick["phase"] for tick in ticks} >= {"TOUCH", "TRACK", "FINISH", "DONE"}
-    assert "L R1 convex, nominal" in (out / "table.md").read_text()
-    pictures = {path.name: path.read_text() for path in (out / "figures").iterdir()}
+    study(run, ("r1_convex",))
+    assert "L R1 convex, nominal" in run.text[0]
+    assert "MISSED" not in run.text[0]
+    with (tmp_path / "runs.csv").open() as file:
+        assert [row["case"] for row in csv.DictReader(file)] == ["l_r1_convex-d60-nominal"]
+    pictures = {path.name: path.read_text() for path in tmp_path.glob("*.svg")}
     assert set(pictures) == {f"l_r1_convex-d60-nominal_{kind}.svg" for kind in ("paths", "along")}
     assert all("<svg" in picture for picture in pictures.values())
-
-
-def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(app, ["reproduce", "weld", "--rows", "nonsense", "--out", str(tmp_path / "x")])
-    assert answer.exit_code == 1
-    assert "Unknown row 'nonsense'" in answer.stderr

@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial.transform import Rotation
 
+from tests.worlds.cell import HOME, SPREAD_RAD, visible, wrong_arm
 from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arms.chain import Chain, chain_poses, load_chain
-from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
 from weldcal.tools.report.render import csv_text
 
@@ -48,44 +47,17 @@ def make_world(seed: int, *, alike: bool = False) -> DoctorWorld:
     """Return a cell of its own for each seed: arm, scanner place, and 10 to 20 poses in front of the scanner."""
     rng = np.random.default_rng([seed, 18])
     name = ARMS[int(rng.integers(len(ARMS)))]
-    reach = 1.0 if name == "ur10e" else 0.72
     believed = load_chain(name)
-    true = _off(believed, rng, 2e-4)
+    true = wrong_arm(believed, rng.normal(size=(6, 6)) * np.repeat([4e-5, 2e-4], 3))
     zeros = np.radians(rng.normal(0.0, 0.02, believed.n))
-    at = reach * np.array([0.62, 0.0, 0.95]) + rng.normal(0.0, 0.05, 3)
-    look = Rotation.from_euler(
-        "xyz", [180.0 + rng.normal(0, 6), rng.normal(0, 6), rng.uniform(-180, 180)], degrees=True
-    )
-    X_BC = pose(look.as_matrix(), at)
+    home = HOME + rng.normal(0.0, 0.1, 6)
+    faced = pose(exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.normal(0.0, 0.1, 3)), [0.0, 0.0, 0.62])
+    X_BC = chain_poses(believed, home[None])[0] @ faced
     guess = X_BC @ pose(exp_rotation(rng.normal(0.0, 0.01, 3)), rng.normal(0.0, 0.008, 3))
-    warp = np.concatenate(
-        [[rng.normal(0.0, 1.5e-3)], rng.normal(0.0, 6e-3, 2), rng.normal(0.0, 8e-3, 3), rng.normal(0.0, 0.02, 2)]
-    )
+    sigma = np.array([1.5e-3, *(6e-3,) * 2, *(8e-3,) * 3, *(0.02,) * 2])
+    spread = SPREAD_RAD * (0.01 if alike else 0.6)
     wanted = int(rng.integers(10, 21))
-    arm = load_arm(name)
-    found: list[Array] = []
-    near: Array | None = None
-    middle: Array | None = None
-    for _ in range(4000):
-        if len(found) == wanted:
-            break
-        spread = np.array([0.13, 0.10, 0.13])
-        tilt, spin = np.radians(25.0), np.pi / 3
-        if alike and middle is not None:
-            spread, tilt, spin = np.full(3, 0.008), np.radians(0.6), np.radians(0.6)
-        p = (np.array([0.0, 0.0, 0.62]) if middle is None or not alike else middle) + rng.uniform(-spread, spread)
-        angle = tilt * np.sqrt(rng.uniform())
-        turn = Rotation.from_rotvec(angle * np.array([np.cos(a := rng.uniform(0, 2 * np.pi)), np.sin(a), 0.0]))
-        R_CF = turn.as_matrix() @ Rotation.from_euler("zx", [rng.uniform(-spin, spin), np.pi]).as_matrix()
-        X = X_BC @ pose(R_CF, p)
-        answers = inverse_kinematics(arm, RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]))
-        if len(answers) == 0:
-            continue
-        if near is None:
-            near, middle = answers[int(rng.integers(len(answers)))], p
-        q = answers[np.argmin(np.abs(np.angle(np.exp(1j * (answers - near)))).sum(axis=1))]
-        if np.abs(np.angle(np.exp(1j * (q - near)))).max() < 2.2:
-            found.append(q)
+    q = visible(believed, X_BC, rng, wanted, home=home, spread=spread, field=(0.21, 0.49, 0.75), tilt_deg=25.0)
     return DoctorWorld(
         rng=rng,
         name=name,
@@ -94,16 +66,9 @@ def make_world(seed: int, *, alike: bool = False) -> DoctorWorld:
         zeros=zeros,
         X_BC=X_BC,
         guess=guess,
-        warp=warp,
-        q=np.array(found),
+        warp=rng.normal(0.0, sigma),
+        q=q,
     )
-
-
-def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
-    stack = chain.stack.copy()
-    stack[:, :3, 3] += rng.normal(0.0, length, (chain.n, 3))
-    stack[:, :3, :3] = stack[:, :3, :3] @ exp_rotation(rng.normal(0.0, 4e-5, (chain.n, 3)))
-    return replace(chain, stack=stack)
 
 
 def observe(

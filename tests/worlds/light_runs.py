@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
+from tests.worlds.cell import scanned
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -139,23 +140,9 @@ def _observe(world: _World, q: Array, id: str, rng: np.random.Generator) -> Obse
     """Return the observation at reported joints q (6,) rad."""
     sigma = world.repeatability_m / float(np.linalg.norm(jacobian(world.arm, q)[3:]))
     X_CR = world.X_BC.inverse() @ forward_kinematics(world.true_arm, q + sigma * rng.standard_normal(6)) @ world.X_FR
-    p, n = _seen(world.device, X_CR, _FACE_M, rng)
+    p, n, _ = scanned(world.device.measured, X_CR, _FACE_M, rng, _CENTRE_M, _NORMAL_RAD)
     X_BR = forward_kinematics(world.arm, q) @ world.X_FR
     return Observation(id, X_BR, p, n, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
-
-
-def _seen(
-    device: ScannerPreset, X_CR: RigidTransform, radius_m: float, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Centre (3,) m and normal (3,) of a circle of that radius as the device measures it, with the noise of a fit."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    ring = radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(12)])
-    face = device.measured(X_CR.multiply(ring.T).T)
-    n = np.linalg.svd(face - face.mean(axis=0))[2][2]
-    n = n * np.sign(n @ X_CR.rotation().matrix()[:, 2])
-    lean = _NORMAL_RAD * rng.standard_normal(3)
-    n = exp_rotation(lean - n * float(n @ lean)) @ n
-    return device.measured(np.asarray(X_CR.translation())) + _CENTRE_M * rng.standard_normal(3), n
 
 
 def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array) -> tuple[int, CalibrationEstimate]:
@@ -235,7 +222,7 @@ def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorl
         q = stop(scenario.robot, scene.arm, pose.q)
         assert q is not None
         X_CR = true.seen(q, stop(scenario.robot_2, scene.arm_2, pose.q_2))
-        p, n = _seen(device, X_CR, radius, rng)
+        p, n, _ = scanned(device.measured, X_CR, radius, rng, _CENTRE_M, _NORMAL_RAD)
         C = np.diag([_NORMAL_RAD**2] * 3 + [_CENTRE_M**2] * 3)
         seen.append(ObservedCircle(f"pose{k + 1:02d}", pose, scene.observation(pose.q, pose.q_2, p, n, C), 1.0))
     return MountedWorld(scene, true, device, tuple(seen))

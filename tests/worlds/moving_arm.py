@@ -1,8 +1,4 @@
-"""A UR arm's exact motion through waypoints, and its picture in which each pixel mixes over its exposure.
-
-A segment has one path parameter s from 0 to 1; s(t) accelerates, cruises and brakes with constant rates. moveJ
-interpolates the joints by s, moveL the flange's position, its rotation about one axis. The arm rests at each waypoint
-for the dwell time.
+"""A moving UR arm, and its picture in which each pixel mixes over its exposure.
 
 Every link is a body of its own in its own frame. A ray of a pixel and a time is cast in the link's frame of that time,
 so that no frame is rendered with an arm at rest. Bodies are the drawn solids of the arm's description and the mesh of
@@ -12,18 +8,16 @@ its flange.
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
-from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.inverse import continued_solution, inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, link_frames
+from tests.worlds.streams import Moves, closed_moves
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import arm_urdf, placed_solid
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth, noisy_depth
@@ -33,137 +27,22 @@ from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.scanner_streams import ScannerStream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset
 
-MOVES = ("moveJ", "moveL")
-_SAMPLES = 33  # of a segment, for its length and its largest speed
-
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5
 """Four corners of a cube that lie in no plane (section 3.2 of the paper), in units of its edge."""
 
 
-@dataclass(frozen=True)
-class Trapezoid:
-    """s from 0 to 1 with the greatest rate ``v`` (1/s) and acceleration ``a`` (1/s^2)."""
-
-    v: float
-    a: float
-
-    @property
-    def ramp_s(self) -> float:
-        """Length of each ramp, s."""
-        return min(self.v / self.a, float(np.sqrt(1.0 / self.a)))
-
-    @property
-    def duration_s(self) -> float:
-        """From rest to rest, s."""
-        return 1.0 / (self.a * self.ramp_s) + self.ramp_s
-
-    def s(self, t: float) -> float:
-        """Return the parameter at ``t`` s after the start."""
-        ramp, whole = self.ramp_s, self.duration_s
-        if t <= 0.0:
-            return 0.0
-        if t >= whole:
-            return 1.0
-        if t < ramp:
-            return 0.5 * self.a * t * t
-        if t > whole - ramp:
-            return 1.0 - 0.5 * self.a * (whole - t) ** 2
-        return self.a * ramp * (t - 0.5 * ramp)
-
-
-class Segment:
-    """One move between two joint configurations (6,) rad at a flange speed (m/s) and acceleration (m/s^2)."""
-
-    def __init__(self, arm: ArmModel, q_from: Array, q_to: Array, move: str, speed: float, acceleration: float) -> None:
-        if move not in MOVES:
-            raise InputError(f"The move '{move}' is not known: use {' or '.join(MOVES)}.")
-        self._arm, self._linear = arm, move == "moveL"
-        self._q = (q_from, q_to)
-        self._X = tuple(forward_kinematics(arm, q) for q in self._q)
-        turn = AngleAxis((self._X[0].rotation().inverse() @ self._X[1].rotation()).matrix())
-        self._axis, self._angle = turn.axis(), turn.angle()
-        places = np.array([self._pose(s).translation() for s in np.linspace(0.0, 1.0, _SAMPLES)])
-        # metres of flange travel per unit of s, where it is fastest
-        self.length_m = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) * (_SAMPLES - 1)
-        if self.length_m < 1e-6:
-            raise InputError("Two waypoints in a row are the same place: the path needs a distance between them.")
-        self.profile = Trapezoid(speed / self.length_m, acceleration / self.length_m)
-
-    def _pose(self, s: float) -> RigidTransform:
-        if not self._linear:
-            return forward_kinematics(self._arm, self._q[0] + s * (self._q[1] - self._q[0]))
-        a, b = (X.translation() for X in self._X)
-        turned = self._X[0].rotation() @ RotationMatrix(AngleAxis(s * self._angle, self._axis))
-        return RigidTransform(turned, a + s * (b - a))
-
-    def joints(self, s: float) -> Array:
-        """Joint angles (6,) rad at ``s``."""
-        q = self._q[0] + s * (self._q[1] - self._q[0])
-        found = continued_solution(self._arm, self._pose(s), q) if self._linear else q
-        if found is None:
-            raise InputError(
-                "A straight move passes a singularity of the arm: use moveJ, or another place of the cube."
-            )
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class RobotPath:
-    """The moves one after the other, over and over: at rest before 0, and the arm's own dwell at each waypoint (s)."""
-
-    arm: ArmModel
-    waypoints: tuple[Array, ...]
-    segments: tuple[Segment, ...]
-    dwell_s: float
-
-    @cached_property
-    def starts_s(self) -> Array:
-        """When each segment begins, and when the loop is closed (n + 1,) s."""
-        return np.concatenate([[0.0], np.cumsum([s.profile.duration_s + self.dwell_s for s in self.segments])])
-
-    @property
-    def loop_s(self) -> float:
-        """Time of one loop, s."""
-        return float(self.starts_s[-1])
-
-    def joints(self, t: float) -> Array:
-        """Joint angles (6,) rad at time ``t`` s."""
-        if t <= 0.0:
-            return self.waypoints[0]
-        t = float(np.mod(t, self.loop_s))
-        k = int(np.searchsorted(self.starts_s, t, side="right")) - 1
-        k = min(k, len(self.segments) - 1)
-        return self.segments[k].joints(self.segments[k].profile.s(t - float(self.starts_s[k])))
-
-    def pose(self, t: float) -> RigidTransform:
-        """Flange pose X_BF at time ``t`` s."""
-        return forward_kinematics(self.arm, self.joints(t))
-
-
-def path_through(
-    arm: ArmModel,
-    poses: list[RigidTransform],
-    q_near: Array,
-    *,
-    move: str = "moveJ",
-    speed: float = 0.25,
-    acceleration: float = 1.2,
-    dwell_s: float = 0.0,
-) -> RobotPath:
-    """Return a closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
+def path_through(arm: ArmModel, poses: list[RigidTransform], q_near: Array, move: str, **options: float) -> Moves:
+    """Return closed moves through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
 
     Raises InputError out of reach.
     """
-    if len(poses) < 2 or not (speed > 0.0 and acceleration > 0.0 and dwell_s >= 0.0):
-        raise InputError("A path needs two poses, and a positive speed and acceleration.")
     q: list[Array] = []
     for X in poses:
         found = nearest_solution(arm, X, q[-1] if q else q_near)
         if found is None:
             raise InputError(f"A waypoint is out of the {arm.name}'s reach: move the cube nearer, or make it smaller.")
         q.append(found)
-    moves = tuple(Segment(arm, a, b, move, speed, acceleration) for a, b in pairwise([*q, q[0]]))
-    return RobotPath(arm, tuple(q), moves, dwell_s)
+    return closed_moves(np.array(q), linear=move == "moveL", robot=arm.name, fastest=True, pause_s=0.0, **options)
 
 
 def cube_poses(
@@ -261,7 +140,6 @@ class MovingScene:
         self._moving = [_Cast([b for b in bodies if b.link == k]) for k in links]
         fixed = [b for b in bodies if b.link is None]
         self._fixed = [_Cast([RigidBody(None, merge(*(b.mesh for b in fixed)))])] if fixed else []
-        self._X_WC = RigidTransform()
         self._background: tuple[Array, Depth] | None = None  # camera pose and its depth map
         u = (np.arange(scanner.width) - scanner.cx) / scanner.fx
         v = (np.arange(scanner.height) - scanner.cy) / scanner.fy
@@ -278,16 +156,13 @@ class MovingScene:
         *,
         samples: int = 5,
         scanner: ScannerPreset | None = None,
-        X_BW: RigidTransform | None = None,
     ) -> Depth:
         """Return the depth map (H, W) m of one frame, 0 where nothing was measured.
 
         ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle
         row. ``samples`` times of the exposure are mixed. ``scanner`` has the errors of this frame (the preset's).
-        ``X_BW`` is the pose in the base of what stands still (identity).
         """
         device = self.scanner if scanner is None else scanner
-        self._X_WC = X_BC if X_BW is None else X_BW.InvertAndCompose(X_BC)
         depth, dark = self._mixed(joints, X_BC, capture_s, samples, rng)
         rows, columns = (np.flatnonzero(depth.any(axis=k)) for k in (1, 0))
         out = np.zeros_like(depth)
@@ -341,7 +216,7 @@ class MovingScene:
     ) -> Depth:
         """Depth (H, W) with each row at its own time; ``dark`` takes the darkness of what the moving bodies show."""
         height, width = self._rays.shape[:2]
-        out = self._static(self._X_WC).copy()
+        out = self._static(X_CB.inverse()).copy()
         row_times = t + self.stream.readout_s * (np.arange(height) / max(height - 1, 1) - 0.5)
         nodes = np.linspace(row_times[0], row_times[-1], _NODES) if self.stream.readout_s > 0.0 else np.array([t])
         frames = [link_frames(self.arm, joints(float(time))) for time in nodes]

@@ -6,16 +6,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
-from weldcal.calibration.geometry.se3 import pose
+from weldcal.calibration.geometry.se3 import as_transform, pose
 from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.inverse import continued_solution
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
 
 ROBOT = "ur10e"
 SPEED, ACCELERATION = 0.25, 1.2  # m/s, m/s^2
 PAUSE_S = 0.1  # a choice: a controller's settling between two moves
-
-_FEWEST = 6
-_LARGEST = 1e6  # sigmas beyond this are of directions that the motion does not show at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +30,16 @@ class Moves:
     lengths: Array
     linear: bool
     speed: float = SPEED
+    robot: str = ROBOT
+    acceleration: float = ACCELERATION
+    pause_s: float = PAUSE_S
 
     def at(self, t: Array) -> Array:
         """Flange poses X_BF (..., 4, 4) at times (...) s, exact."""
         k, s = self._progress(np.ravel(t))
         j = (k + 1) % len(self.q)
         if not self.linear:
-            X = chain_poses(load_chain(ROBOT), self.q[k] + s[:, None] * (self.q[j] - self.q[k]))
+            X = chain_poses(load_chain(self.robot), self.q[k] + s[:, None] * (self.q[j] - self.q[k]))
         else:
             R = Rotation.from_matrix(self.poses[:, :3, :3])
             turn = (R[k].inv() * R[j]).as_rotvec()
@@ -46,29 +48,49 @@ class Moves:
         return X.reshape(*np.shape(t), 4, 4)
 
     def joints(self, t: Array) -> Array:
-        """Joint angles (N, J) rad of a moveJ at times (N,) s."""
-        k, s = self._progress(t)
-        return np.asarray(self.q[k] + s[:, None] * (self.q[(k + 1) % len(self.q)] - self.q[k]))
+        """Joint angles (N, J) rad at times (N,) s."""
+        k, s = self._progress(np.ravel(t))
+        q = np.asarray(self.q[k] + s[:, None] * (self.q[(k + 1) % len(self.q)] - self.q[k]))
+        if not self.linear:
+            return q
+        arm = load_arm(self.robot)
+        found = [
+            continued_solution(arm, as_transform(X), near) for X, near in zip(self.at(np.ravel(t)), q, strict=True)
+        ]
+        return np.array(found, dtype=float)
+
+    @property
+    def _peaks(self) -> Array:
+        """The largest speed (n,) m/s of each move: a short one does not reach the speed."""
+        return np.minimum(self.speed, np.sqrt(self.acceleration * self.lengths))
+
+    @property
+    def ends_s(self) -> Array:
+        """When each move has ended, its pause included (n,) s; the last one closes the loop."""
+        return np.cumsum(self._peaks / self.acceleration + self.lengths / self._peaks + self.pause_s)
 
     def _progress(self, t: Array) -> tuple[np.ndarray, Array]:
-        """Which move, and the share 0..1 of it done."""
-        ramp = self.speed / ACCELERATION
-        cruise = self.lengths / self.speed - ramp
-        duration = 2.0 * ramp + cruise + PAUSE_S
-        ends = np.cumsum(duration)
-        t = np.mod(t, ends[-1])
+        """Which move, and the share 0..1 of it done; at rest before 0."""
+        a, ends = self.acceleration, self.ends_s
+        t = np.mod(np.maximum(t, 0.0), ends[-1])
         k = np.minimum(np.searchsorted(ends, t, side="right"), len(ends) - 1)
-        x = t - (ends - duration)[k]
-        c = cruise[k]
-        up = 0.5 * ACCELERATION * np.minimum(x, ramp) ** 2
-        steady = self.speed * np.clip(x - ramp, 0.0, c)
+        x, v, length = t - np.append(0.0, ends)[k], self._peaks[k], self.lengths[k]
+        ramp = v / a
+        c = length / v - ramp
         y = np.clip(x - ramp - c, 0.0, ramp)
-        return k, (up + steady + self.speed * y - 0.5 * ACCELERATION * y**2) / self.lengths[k]
+        up, steady = 0.5 * a * np.minimum(x, ramp) ** 2, v * np.clip(x - ramp, 0.0, c)
+        return k, (up + steady + v * y - 0.5 * a * y**2) / length
 
 
-def closed_moves(way: Array, *, linear: bool) -> Moves:
-    """Moves through waypoints (n, J) rad and back to the first one."""
-    chain = load_chain(ROBOT)
+def closed_moves(way: Array, *, linear: bool, robot: str = ROBOT, fastest: bool = False, **options: float) -> Moves:
+    """Moves through waypoints (n, J) rad and back to the first one.
+
+    Args:
+        way: the waypoints. linear: moveL, else moveJ. robot: its name.
+        fastest: the speed of a moveJ is that of the flange where it is fastest; else its mean.
+        options: speed m/s, acceleration m/s^2, pause_s.
+    """
+    chain = load_chain(robot)
     poses = chain_poses(chain, way)
     after = np.roll(np.arange(len(way)), -1)
     steps = np.linspace(0.0, 1.0, 200)
@@ -76,8 +98,9 @@ def closed_moves(way: Array, *, linear: bool) -> Moves:
     if not linear:
         for k in range(len(way)):
             path = chain_poses(chain, way[k] + steps[:, None] * (way[after[k]] - way[k]))[:, :3, 3]
-            lengths[k] = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-    return Moves(way, poses, lengths, linear)
+            apart = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            lengths[k] = apart.max() * len(apart) if fastest else apart.sum()
+    return Moves(way, poses, lengths, linear, robot=robot, **options)
 
 
 def recorded_stream(

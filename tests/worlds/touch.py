@@ -3,17 +3,17 @@
 Its true arm, scanner and tip, the calibration from its scans, and touches of plates, spheres, an edge and a point.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from tests.worlds.wrong_models import distorted
+from tests.worlds.cell import Bend, bend, distorted, factory_errors, scanned, wrong_arm
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, pose
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.touch.touches import EDGE, PLANE, POINT, SPHERE, Touch
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
@@ -54,12 +54,12 @@ def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
     to 0.05 mm per axis and whose ball is up to 0.02 mm too large or small; contact that is seen 0.02 mm early or late.
     """
     rng, nominal = np.random.default_rng(seed), load_arm("ur10e")
-    true = _wrong(nominal, rng)
+    true = wrong_arm(nominal, factory_errors(rng))
     down = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), np.add(_WORK, [0.0, 0.0, 0.80]))
     X_BC = down @ RigidTransform(
         RotationMatrix.ProjectToRotationMatrix(exp_rotation(0.15 * rng.normal(size=3))), np.zeros(3)
     )
-    scanner = _Scanner(X_BC.inverse(), (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal()))
+    scanner = _Scanner(X_BC.inverse(), bend(rng))
     observations = [_scan(f"p{i}", nominal, true, scanner, rng) for i in range(scans)]
     tip = _TIP + _TAUGHT_M * rng.normal(size=3)
     ball = _TIP_RADIUS + _BALL_M * rng.uniform(-1.0, 1.0)
@@ -72,22 +72,11 @@ def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
 @dataclass(frozen=True, eq=False)
 class _Scanner:
     X_CB: RigidTransform
-    bend: tuple[float, Array, float]
+    bend: Bend
 
     def sees(self, p_B: Array) -> Array:
         """Where the scanner puts a point (3,) m of the base."""
         return distorted(np.asarray(self.X_CB.multiply(p_B)), self.bend)
-
-
-def _wrong(arm: ArmModel, rng: np.random.Generator) -> ArmModel:
-    stack = arm.stack.copy()
-    for i in range(6):
-        turn = np.radians(
-            np.array([0.02 * rng.normal(), 0.02 * rng.normal(), rng.uniform(0.02, 0.05) * rng.choice([-1, 1])])
-        )
-        shift = rng.uniform(1e-4, 3e-4, 3) / np.sqrt(3.0) * rng.choice([-1, 1], 3)
-        stack[i] = stack[i] @ pose(exp_rotation(turn), shift)
-    return replace(arm, stack=stack)
 
 
 def _upright(rng: np.random.Generator, tilt_rad: float) -> RotationMatrix:
@@ -111,15 +100,10 @@ def _scan(id: str, nominal: ArmModel, true: ArmModel, scanner: _Scanner, rng: np
     place = _WORK + [0.0, 0.0, 0.12] + rng.uniform(-1.0, 1.0, 3) * [0.15, 0.15, 0.10]
     R_BF = _upright(rng, np.radians(25.0))
     q = _joints(nominal, RigidTransform(R_BF, place) @ RigidTransform(-np.asarray(_X_FR.translation())))
-    X = forward_kinematics(true, q) @ _X_FR
-    p = X.translation() + _REPEAT_M * rng.normal(size=3)
-    R = X.rotation().matrix()
-    ends = [scanner.sees(p + 0.03 * R[:, k]) - scanner.sees(p - 0.03 * R[:, k]) for k in (0, 1)]
-    z = exp_rotation(_NORMAL_RAD * rng.normal(size=3)) @ np.cross(ends[0], ends[1])
-    c = scanner.sees(p) + _CENTRE_M * rng.normal(size=3)
-    return Observation(
-        id, forward_kinematics(nominal, q) @ _X_FR, c, z / np.linalg.norm(z), _CENTRE_M**2 * np.eye(3), _NORMAL_RAD
-    )
+    X_CR = scanner.X_CB @ forward_kinematics(true, q) @ _X_FR
+    X_CR.set_translation(X_CR.translation() + _REPEAT_M * rng.normal(size=3))
+    c, z, _ = scanned(lambda p: distorted(p, scanner.bend), X_CR, 0.03, rng, _CENTRE_M, _NORMAL_RAD)
+    return Observation(id, forward_kinematics(nominal, q) @ _X_FR, c, z, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
 
 
 def _calibrated(observations: list[Observation]) -> CalibrationResult:

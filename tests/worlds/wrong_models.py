@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.stats import f as fisher
 
+from tests.worlds.cell import HOME, Bend, bend, distorted, factory_errors, scanned, visible
 from tests.worlds.flange_frames import facing
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
@@ -20,7 +21,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, pose
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, flange_poses, inverse, pose
 from weldcal.calibration.planning.observability import check_diversity
 from weldcal.calibration.refinement.kinematics_fit import (
     ArmErrors,
@@ -42,6 +43,7 @@ X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4  # of a centre and a normal per axis, and of a hole circle's ratio
 _FIELD = 0.5  # half of what the scanner sees over its distance
 _BORDER = 12  # pixels
+_RING_M = 0.02  # radius of the ring by which such a scanner sees a face
 _ARM_WAVE_M = 0.8
 _REACH = np.array([0.12, 0.10, 0.06])  # m, of the places round the middle of the field
 _CENTRE = np.array([0.0, 0.0, REFERENCE_M])
@@ -73,25 +75,20 @@ def warped_observations(
 
     The arm's stated positions are off by a smooth field of ``arm_m`` (per axis, rms).
     """
-    rng, observations, patterns, h = np.random.default_rng((device, seed)), [], {}, 0.02
+    rng, observations, patterns = np.random.default_rng((device, seed)), [], {}
     for k in range(n):
         true = _CENTRE + rng.uniform(-_REACH, _REACH)
         R_CR = RollPitchYaw(
             np.pi + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(-3, 3)
         ).ToRotationMatrix()
-        x, y = (
-            (warped_point(true + h * axis, device, warp_m) - warped_point(true - h * axis, device, warp_m)) / (2.0 * h)
-            for axis in R_CR.matrix().T[:2]
-        )
-        normal = np.cross(x, y)
-        normal = normal / np.linalg.norm(normal) + NOISE_RAD * rng.standard_normal(3)
-        p_C = warped_point(true, device, warp_m) + NOISE_M * rng.standard_normal(3)
+        X_CR = RigidTransform(R_CR, true)
+        p_C, normal, ratio = scanned(lambda p: warped_point(p, device, warp_m), X_CR, _RING_M, rng, NOISE_M, NOISE_RAD)
         name = f"p{k:02d}"
-        X_BR = X_BC @ RigidTransform(R_CR, true)
+        X_BR = X_BC @ X_CR
         if arm_m:
             X_BR = RigidTransform(X_BR.rotation(), X_BR.translation() - arm_error(X_BR.translation(), device, arm_m))
-        observations.append(Observation(name, X_BR, p_C, normal / np.linalg.norm(normal)))
-        ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
+        observations.append(Observation(name, X_BR, p_C, normal))
+        ratio += NOISE_RATIO * rng.standard_normal()
         patterns[name] = _circle(RigidTransform(R_CR, p_C), p_C, ratio)
     return observations, patterns
 
@@ -196,8 +193,6 @@ SCANS, NEW = 20, 25
 _CENTRE_M, _NORMAL_RAD = 2e-5, float(np.radians(0.01))  # of a scan's fit, and of the arm's repeatability, per axis
 _REPEAT_M = 2e-5
 _REACH_M, _RATIO = 0.025, 3e-4  # radius of the hole circle, and how well a scan measures its size
-_HOME = np.radians([20.0, -80.0, 105.0, -115.0, -90.0, 30.0])
-_SPREAD_RAD = np.array([0.5, 0.4, 0.5, 0.8, 0.8, 1.5])
 _CANDIDATES = 250
 
 
@@ -229,79 +224,36 @@ def station(
     Without ``links`` only the joints' zeros are wrong; ``size`` multiplies the errors.
     """
     rng, arm = np.random.default_rng(seed), load_chain("ur10e")
-    errors = np.zeros((arm.n, 6))
-    sign = rng.choice([-1.0, 1.0], (arm.n, 6))
-    errors[:, 2] = np.radians(rng.uniform(0.02, 0.05, arm.n)) * sign[:, 2]
-    errors[:, :2] = np.radians(0.02) * rng.normal(size=(arm.n, 2))
-    errors[:, 3:] = rng.uniform(1e-4, 3e-4, (arm.n, 3)) / np.sqrt(3.0) * sign[:, 3:]
+    errors = factory_errors(rng) * size
     if not links:
         errors[:, [0, 1, 3, 4, 5]] = 0.0
-    errors *= size
-    flange = flange_poses(arm, _HOME[None], np.zeros((arm.n, 6)))[0]
+    flange = flange_poses(arm, HOME[None], np.zeros((arm.n, 6)))[0]
     X_BC = flange @ pose(
         exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(0.2 * rng.normal(size=3)), np.array([0.0, 0.0, 0.65])
     )
-    q = _visible(arm, X_BC, rng, _CANDIDATES + new)
-    guess = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BC[:3, :3]), X_BC[:3, 3])
+    q = visible(arm, X_BC, rng, _CANDIDATES + new)
+    guess = as_transform(X_BC)
     chosen = informative_poses(arm, guess, q[:_CANDIDATES], scans) if planned else np.arange(scans)
-    bend = (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal())
+    bent = bend(rng)
     one, other = q[chosen], q[_CANDIDATES:]
-    seen, patterns = _seen(arm, one, errors, X_BC, bend, rng, "p")
-    return WrongArmStation(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
-
-
-def _visible(arm: Chain, X_BC: Array, rng: np.random.Generator, n: int) -> Array:
-    """Joint angles (n, 6) at which the flange faces the scanner within 40 degrees, in its field and range."""
-    out: list[Array] = []
-    while len(out) < n:
-        q = _HOME + _SPREAD_RAD * rng.uniform(-1.0, 1.0, (4000, arm.n))
-        X = inverse(X_BC) @ flange_poses(arm, q, np.zeros((arm.n, 6)))
-        p, z = X[:, :3, 3], X[:, :3, 2]
-        good = (p[:, 2] > 0.4) & (p[:, 2] < 0.95) & (np.abs(p[:, :2]) < 0.35 * p[:, 2:]).all(axis=1)
-        good &= -(z * p).sum(axis=1) > np.cos(np.radians(40.0)) * np.linalg.norm(p, axis=1)
-        out += list(q[good])
-    return np.array(out[:n])
-
-
-def _observation(id: str, stated: Array, p: Array, z: Array) -> Observation:
-    X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(stated[:3, :3]), stated[:3, 3])
-    return Observation(id, X, p, z / np.linalg.norm(z), _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
+    seen, patterns = _seen(arm, one, errors, X_BC, bent, rng, "p")
+    return WrongArmStation(seen, one, _seen(arm, other, errors, X_BC, bent, rng, "n")[0], other, errors, patterns)
 
 
 def _seen(
-    arm: Chain,
-    q: Array,
-    errors: Array,
-    X_BC: Array,
-    bend: tuple[float, Array, float],
-    rng: np.random.Generator,
-    name: str,
+    arm: Chain, q: Array, errors: Array, X_BC: Array, bent: Bend, rng: np.random.Generator, name: str
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Observe the wrong arm with the wrong scanner, and its hole circles.
-
-    Beside the poses that the controller states.
-    """
+    """Observe the wrong arm with the wrong scanner, and its hole circles, beside the poses that the controller states."""
     stated, real = flange_poses(arm, q, np.zeros((arm.n, 6))), flange_poses(arm, q, errors)
     out, patterns = [], {}
     for i, X in enumerate(inverse(X_BC) @ real):
-        p = X[:3, 3] + _REPEAT_M * rng.normal(size=3)
-        # the face is where the scanner puts the ends of two of its diameters
-        a, b = (distorted(p + _REACH_M * X[:3, k], bend) - distorted(p - _REACH_M * X[:3, k], bend) for k in (0, 1))
-        ratio = float(np.linalg.norm(a) + np.linalg.norm(b)) / (4.0 * _REACH_M) + _RATIO * rng.normal()
-        z = np.cross(a, b)
-        z = exp_rotation(_NORMAL_RAD * rng.normal(size=3)) @ (z / np.linalg.norm(z))
-        c = distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
-        out.append(_observation(f"{name}{i}", stated[i], c, z))
-        X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), c)
-        patterns[out[-1].id] = _circle(X_CR, c, ratio)
+        X_CR = as_transform(X)
+        X_CR.set_translation(X[:3, 3] + _REPEAT_M * rng.normal(size=3))
+        c, z, ratio = scanned(lambda p: distorted(p, bent), X_CR, _REACH_M, rng, _CENTRE_M, _NORMAL_RAD)
+        ratio += _RATIO * rng.normal()
+        out.append(Observation(f"{name}{i}", as_transform(stated[i]), c, z, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD))
+        patterns[out[-1].id] = _circle(RigidTransform(X_CR.rotation(), c), c, ratio)
     return out, patterns
-
-
-def distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
-    """Where a scanner with errors in scale, gradient (2,) and radial distortion puts a point (3,) m of its frame."""
-    scale, gradient, radial = bend
-    x = p[:2] / p[2]
-    return np.asarray(p * (1.0 + scale + gradient @ p[:2] + radial * float(x @ x)))
 
 
 @dataclass(frozen=True)

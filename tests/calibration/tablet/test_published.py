@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tests.figures.__main__ import app
+from tests.figures.harness import Run
+from tests.figures.tablet.reproduce import compare_models, reproduce_stages, tablet
 from tests.places import SHARED_DATA, require_data
 from tests.worlds.tablet import STAGE_1, STAGE_2, published_touches
 from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
@@ -19,6 +18,7 @@ from weldcal.calibration.tablet.published import (
     DH_NAMES,
     HTM_NAMES,
     Sign,
+    StageResult,
     evolve,
     fitness,
     hand_to_touch,
@@ -40,25 +40,10 @@ def touches() -> TabletTouches:
     return published_touches()
 
 
-@dataclass(frozen=True)
-class Reproduction:
-    """What one run of the command left."""
-
-    summary: dict[str, Any]
-    page: str
-    picture: str
-
-
 @pytest.fixture(scope="module")
-def reproduction(tmp_path_factory: pytest.TempPathFactory) -> Reproduction:
-    """The command itself, without the slow search and with few trials."""
-    folder = tmp_path_factory.mktemp("tablet") / "out"
-    options = ["tablet", "--evolution-seeds", "0", "--trials", "2", "--seed", "5", "--json", "--out", str(folder)]
-    finished = CliRunner().invoke(app, ["reproduce", *options])
-    assert finished.stdout, finished.output
-    summary = json.loads(finished.stdout.splitlines()[-1])
-    assert finished.exit_code == (0 if summary["met"] else 1)
-    return Reproduction(summary, (folder / "table.md").read_text(), (folder / "figures/residuals.svg").read_text())
+def found(touches: TabletTouches) -> dict[tuple[str, int], StageResult]:
+    """The fast solver's stages of both chains."""
+    return {(r.model, r.stage): r.ours for r in reproduce_stages(touches, ())[0]}
 
 
 def test_the_typed_tables_are_those_of_the_shared_file(touches: TabletTouches) -> None:
@@ -80,45 +65,40 @@ def test_the_typed_tables_are_those_of_the_shared_file(touches: TabletTouches) -
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-9)
 
 
-def test_every_table_comes_out(reproduction: Reproduction) -> None:
-    tables = reproduction.summary["tables"]
-    for number, F in (("7", 1.6739), ("10", 0.9989), ("8", 7.103), ("11", 4.272)):
-        assert tables[number]["ours"]["F"] == pytest.approx(F, abs=GATE_MM)
-    assert reproduction.summary["F1"] == tables["7"]["ours"]["F"]
+def test_every_table_comes_out(found: dict[tuple[str, int], StageResult]) -> None:
+    for stage, F in ((("htm", 1), 1.6739), (("htm", 2), 0.9989), (("dh", 1), 7.103), (("dh", 2), 4.272)):
+        assert pytest.approx(F, abs=GATE_MM) == found[stage].fitness.F
 
 
-def test_the_parameters_are_the_printed_ones(reproduction: Reproduction) -> None:
-    tables = reproduction.summary["tables"]
-    seven = tables["7"]["ours"]["parameters"]
+def test_the_parameters_are_the_printed_ones(found: dict[tuple[str, int], StageResult]) -> None:
+    seven = dict(zip(HTM_NAMES, found["htm", 1].parameters, strict=True))
     # the paper's inputs are printed rounded: re-rounded they move x_c and y_c by up to 0.1 mm, the others less
     for name, printed in zip(HTM_NAMES, STAGE_1["htm"].parameters, strict=True):
         mirrored = abs(seven[name]) if name in ("alpha_t", "beta_t") else seven[name]
         wanted = abs(printed) if name in ("alpha_t", "beta_t") else printed
         assert mirrored == pytest.approx(wanted, abs=0.11 if name in ("x_c", "y_c") else 0.035), name
-    eight = tables["8"]["ours"]["parameters"]
+    eight = dict(zip(DH_NAMES, found["dh", 1].parameters, strict=True))
     assert eight["theta1_c"] + eight["gamma_c"] == pytest.approx(-1.28, abs=0.02)
     assert eight["theta1_t"] + eight["gamma_t"] == pytest.approx(-5.90, abs=0.02)
     for name, printed in zip(DH_NAMES, STAGE_1["dh"].parameters, strict=True):
         if "theta1" not in name and name not in ("gamma_c", "gamma_t"):
             assert abs(eight[name]) == pytest.approx(abs(printed), abs=0.035), name
-    for number, stage in (("10", STAGE_2["htm"]), ("11", STAGE_2["dh"])):
-        found = [tables[number]["ours"]["parameters"][name] for name in stage.names]
-        np.testing.assert_allclose(found, stage.parameters, rtol=0, atol=0.02)
+    for model in ("htm", "dh"):
+        np.testing.assert_allclose(found[model, 2].parameters, STAGE_2[model].parameters, rtol=0, atol=0.02)
 
 
-def test_the_report_shows_each_table_and_needs_no_other_file(reproduction: Reproduction) -> None:
+def test_the_figure_shows_each_table_and_a_picture(tmp_path: Path) -> None:
+    run = Run(out=tmp_path)
+    tablet(run)
     for number in (7, 8, 9, 10, 11, 12):
-        assert f"Table {number}" in reproduction.page
-    assert "<svg" in reproduction.picture
-    assert "<script" not in reproduction.picture
-    assert 'src="http' not in reproduction.page + reproduction.picture
+        assert f"Table {number}" in "".join(run.text)
+    assert "<svg" in (tmp_path / "residuals.svg").read_text()
 
 
-def test_left_out_landmarks_are_predicted_three_times_better(reproduction: Reproduction) -> None:
-    left_out = {m["name"]: m["left_out_mm"] for m in reproduction.summary["models"]}
+def test_left_out_landmarks_are_predicted_three_times_better(touches: TabletTouches) -> None:
+    left_out = {m.name: m.left_out_mm for m in compare_models(touches)}
     assert left_out["paper, stage 1 + 2, sign as printed"] == pytest.approx(1.251, abs=0.005)
     assert left_out["closed form"] <= 0.46
-    assert reproduction.summary["leave_one_out_mm"] == left_out["closed form"]
 
 
 def test_differential_evolution_ends_where_the_fast_solver_does(touches: TabletTouches) -> None:

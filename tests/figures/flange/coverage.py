@@ -1,19 +1,16 @@
 """Simulated calibrations without rendering: errors of arms and scanners, and shares of 95 % regions with the truth."""
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Annotated
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-import typer
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
-from tests.figures.harness import Figures, Results, Row, Study
+from tests.figures.harness import Run, figure
 from tests.worlds import wrong_models
-from tests.worlds.light_runs import LightRuns, study_light_runs
+from tests.worlds.light_runs import study_light_runs
 from tests.worlds.wrong_models import (
-    Found,
     as_measured,
     judged,
     measured_by_a_wrong_scanner,
@@ -31,9 +28,8 @@ from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import subplots, svg
-from weldcal.tools.report.render import fixed, statistics, write_atomic
+from weldcal.tools.report.render import fixed, statistics
 
 LEVEL = 0.95
 _ARM_M = 1.5e-4  # per axis, what recorded arms leave of a calibration
@@ -176,54 +172,28 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     )
 
 
-def _coverage_rows(f: Figures) -> Iterable[Row]:
-    for s in f["studies"]:
-        kind = "of another model" if s["warped"] else "corrected" if s["corrected"] else "exact"
-        shares = (f"{100 * s[key]:.1f} %" for key in ("pose", "point"))
-        yield str(s["poses"]), kind, *shares, fixed(s["held_out_over_true"])
+@figure("flange-honesty", "how often stated 95 % regions hold the truth, and held-out over true errors")
+def honesty(run: Run) -> None:
+    """Calibrate many times from few to many scans, with an exact, a corrected and a warped scanner."""
+    runs = run.size(10, 500)
+    studies = [study_coverage(n, runs, run.seed, run.progress) for n in (5, 6, 8, 12, 20)]
+    studies += [study_corrected(n, runs, run.seed, run.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), run.progress))
+    run.write("coverage.svg", coverage_picture(studies))
+    kinds = ("of another model" if s.warped else "corrected" if s.corrected else "exact" for s in studies)
+    rows = (
+        (str(s.poses), kind, f"{100 * s.pose:.1f} %", f"{100 * s.point:.1f} %", fixed(s.held_out_over_true))
+        for s, kind in zip(studies, kinds, strict=True)
+    )
+    run.table("", ("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"), rows)
 
 
-HONESTY = Study(
-    name="flange-honesty",
-    what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
-    header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
-    rows=_coverage_rows,
-    numbers=3,
-)
+def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: bool) -> tuple[float, float]:
+    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on 60 new scans.
 
-
-@command("benchmark flange-honesty", short_help="Measure how often stated 95 % regions hold the truth.", hidden=True)
-def honesty(
-    call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
-) -> Outcome:
-    """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
-    folder = HONESTY.folder(call)
-    studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
-    studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
-    studies.append(study_warped(12, max(10, runs // 5), call.progress))
-    write_atomic(folder / "coverage.svg", coverage_picture(studies))
-    return HONESTY.found({"studies": [vars(s) for s in studies]}, folder)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stated:
-    """Mean error (m) of 60 new scans in each of ``runs`` worlds of one class, and how many times it is stated.
-
-    A class is scans, largest error of the scanner m, rms error of the arm m, with a local field or plain. The ratio
-    is of nested held-out errors, both means over the worlds.
+    Returns:
+        mean error of the new scans (m), and how many times it is stated by the nested held-out errors.
     """
-
-    poses: int
-    warp_m: float
-    arm_m: float
-    local: bool
-    runs: int
-    true_m: float
-    stated_over_true: float
-
-
-def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: bool) -> Stated:
-    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on new scans."""
     stated, true = [], []
     for device in range(runs):
         observations, patterns = wrong_models.warped_observations(device, poses, 0, warp_m, arm_m)
@@ -235,150 +205,52 @@ def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: b
             seen = refined.field.applied(found.estimate.X_BC, seen)
         true.append(float(np.mean(position_errors(found.estimate.X_BC, seen))))
         stated.append(float(np.nanmean(found.estimate.held_out.position_m[found.estimate.inliers])))
-    ratio = float(np.mean(stated) / np.mean(true))
-    return Stated(
-        poses=poses,
-        warp_m=warp_m,
-        arm_m=arm_m,
-        local=local,
-        runs=runs,
-        true_m=float(np.mean(true)),
-        stated_over_true=ratio,
-    )
+    return float(np.mean(true)), float(np.mean(stated) / np.mean(true))
 
 
-def _stated_rows(f: Figures) -> Iterable[Row]:
-    for s in f["classes"]:
-        yield (
-            str(s["poses"]),
-            "local" if s["local"] else "plain",
-            fixed(1e3 * s["warp_m"], 1),
-            fixed(1e3 * s["arm_m"], 2),
-            str(s["runs"]),
-            fixed(1e3 * s["true_m"]),
-            fixed(s["stated_over_true"], 2),
-        )
-    yield "all", "", "", "", str(sum(s["runs"] for s in f["classes"])), "", fixed(f["mean"], 2)
-
-
-STATED = Study(
-    name="flange-stated",
-    what="The stated mean error over the true one, in generated worlds with errors of scanner and arm.",
-    header=("scans", "way", "scanner off, mm", "arm off, mm", "worlds", "true mean error, mm", "stated over true"),
-    rows=_stated_rows,
-    numbers=5,
-)
-
-
-@command("benchmark flange-stated", short_help="Measure stated over true error in generated worlds.", hidden=True)
-def stated(
-    call: Call, runs: Annotated[int, option("--runs", "N", "Number of worlds of each class.", min=2)] = 34
-) -> Outcome:
-    """Measure how many times the true mean error of new scans is stated, in generated worlds with errors of scanner and
-    arm."""
-    folder, classes = STATED.folder(call), []
-    sizes = [(n, False) for n in (8, 12, 20, 30)] + [(20, True)]
-    for k, (poses, local) in enumerate(sizes):
+@figure("flange-stated", "the stated mean error over the true one, with errors of scanner and arm")
+def stated(run: Run) -> None:
+    """Measure how many times the true mean error of new scans is stated, in worlds of fifteen classes."""
+    rows, ratios, runs = [], [], run.size(2, 34)
+    for poses, local in (*((n, False) for n in (8, 12, 20, 30)), (20, True)):
         for warp_m in (2e-4, 8e-4, 1.6e-3):
-            call.progress(f"{poses} scans", k / len(sizes))
-            classes.append(study_stated(poses, warp_m, _ARM_M, runs, local=local))
-    mean = float(np.mean([s.stated_over_true for s in classes]))
-    return STATED.found({"classes": [vars(s) for s in classes], "mean": mean}, folder)
+            run.progress(f"{poses} scans", 0.0)
+            true_m, ratio = study_stated(poses, warp_m, _ARM_M, runs, local=local)
+            ratios.append(ratio)
+            way = "local" if local else "plain"
+            rows.append((str(poses), way, fixed(1e3 * warp_m, 1), fixed(1e3 * true_m), fixed(ratio, 2)))
+    rows.append(("all", "", "", "", fixed(float(np.mean(ratios)), 2)))
+    run.table("", ("scans", "way", "scanner off, mm", "true mean error, mm", "stated over true"), rows)
 
 
-def wrong_arm(seed: int, kind: str) -> Mapping[str, object]:
-    """One world, plain and refined."""
-    return {"kind": kind, **asdict(study_station(station(seed, links=kind == "links"), kind))}
+@figure("flange-arm", "cells with factory-size errors of the arm, calibrated from 20 planned scans, plain and refined")
+def arm(run: Run) -> None:
+    """Calibrate UR10e cells, and judge both ways on new scans."""
+    f = judged([study_station(station(seed, links=True), "links") for seed in run.seeds(2, 40)])
+    rows = (
+        ("error at new scans, plain", f"{f['plain_mm']:.3f} mm mean"),
+        ("error at new scans, refined", f"{f['refined_mm']:.3f} mm mean (ratio {f['ratio']:.2f})"),
+        ("in the stated 95 % region", f"{f['inside_95_percent']:.1f} %"),
+        ("joint offsets within 3 sigma", f"{f['offsets_within_3_sigma_percent']:.1f} %"),
+    )
+    run.table("", ("", "found"), rows)
 
 
-def _arm_figures(results: Results) -> Figures:
-    kinds = [r["kind"] for r in results.values()]
-    found = [Found(**{k: np.array(v) for k, v in r.items() if k != "kind"}) for r in results.values()]
-    return {"worlds": len(found), "kind": kinds[0], **judged(found)}
-
-
-def _arm_rows(f: Figures) -> Iterable[Row]:
-    yield "error at new scans, plain", f"{f['plain_mm']:.3f} mm mean"
-    yield "error at new scans, refined", f"{f['refined_mm']:.3f} mm mean (ratio {f['ratio']:.2f})"
-    yield "in the stated 95 % region", f"{f['inside_95_percent']:.1f} %"
-    yield "joint offsets within 3 sigma", f"{f['offsets_within_3_sigma_percent']:.1f} %"
-
-
-ARM = Study(
-    name="flange-arm",
-    what="UR10e cells with factory-size errors of the arm, calibrated from 20 planned scans, plain and refined.",
-    case=wrong_arm,
-    figures=_arm_figures,
-    header=("", "found"),
-    rows=_arm_rows,
-)
-
-
-@command("benchmark flange-arm", short_help="Calibrate cells with errors of the arm, and refine them.", hidden=True)
-def arm(
-    call: Call,
-    worlds: Annotated[int, option("--worlds", "N", "Number of simulated cells.", min=1)] = 40,
-    kind: Annotated[
-        str, option("--kind", "KIND", "links: all errors of the arm; joints: zeros of the joints only.")
-    ] = "links",
-) -> Outcome:
-    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge
-    both on new scans."""
-    seeds = range(call.seed, call.seed + worlds)
-    return ARM.outcome(call, {f"world {s}": {"seed": s, "kind": kind} for s in seeds})
-
-
-def _imperfect(found: LightRuns) -> dict[str, object]:
+@figure("flange-imperfect", "live calibrations with an imperfect scanner and arm, without rendering")
+def imperfect(run: Run) -> None:
+    """Measure errors at the work point, and how often they lie in the stated 95 % region."""
+    found = study_light_runs(load_scenario("s_groove"), run.size(10, 200), seed=run.seed, progress=run.progress)
     ours, rigid = (statistics(1e3 * v, "mean", "rms", "p95", "max") for v in (found.error_m, found.rigid_m))
-    return {
-        "runs": len(found.error_m),
-        "scans_mean": float(np.mean(found.scans)),
-        "at_work_mm": {"mean": ours["mean"], "p95": ours["p95"], "worst": ours["max"]},
-        "rms_at_work_mm": ours["rms"],
-        "expected_mm": float(1e3 * np.sqrt(np.mean(found.expected_m**2))),
-        "inside_95": found.share_inside,
-        "inside_95_chance": list(found.chance()),
-        "rigid_at_work_mm": {"mean": rigid["mean"], "worst": rigid["max"]},
-    }
-
-
-def _imperfect_rows(f: Figures) -> Iterable[Row]:
-    e, (low, high) = f["at_work_mm"], f["inside_95_chance"]
-    yield (
-        "error at the work point",
-        (
-            f"{e['mean']:.3f} mm mean, {e['p95']:.3f} 95 %, {e['worst']:.3f} at most ({f['rms_at_work_mm']:.3f} rms; "
-            f"{f['expected_mm']:.3f} expected), from {f['scans_mean']:.1f} scans"
-        ),
+    low, high = found.chance()
+    expected = 1e3 * np.sqrt(np.mean(found.expected_m**2))
+    error = (
+        f"{ours['mean']:.3f} mm mean, {ours['p95']:.3f} 95 %, {ours['max']:.3f} at most ({ours['rms']:.3f} rms; "
+        f"{expected:.3f} expected), from {np.mean(found.scans):.1f} scans"
     )
-    yield (
-        "in the stated 95 % region",
-        f"{100 * f['inside_95']:.1f} % of {f['runs']} (exact regions: {100 * low:.1f} to {100 * high:.1f} %)",
+    inside = f"{100 * found.share_inside:.1f} % of {len(found.error_m)}"
+    rows = (
+        ("error at the work point", error),
+        ("in the stated 95 % region", f"{inside} (exact regions: {100 * low:.1f} to {100 * high:.1f} %)"),
+        ("without a scanner correction", f"{rigid['mean']:.3f} mm mean, {rigid['max']:.3f} at most"),
     )
-    yield "without a scanner correction", "{mean:.3f} mm mean, {worst:.3f} at most".format(**f["rigid_at_work_mm"])
-
-
-IMPERFECT = Study(
-    name="flange-imperfect",
-    what=(
-        "Live calibrations with an imperfect scanner and arm, without rendering: errors, and how often they lie in the"
-        " region."
-    ),
-    header=("", "found"),
-    rows=_imperfect_rows,
-)
-
-
-@command("benchmark flange-imperfect", short_help="Calibrate with an imperfect scanner and arm.", hidden=True)
-def imperfect(
-    call: Call,
-    scenario: Annotated[
-        str, typer.Argument(metavar="[SCENARIO]", help="A scenario with simulated arm and scanner.")
-    ] = "s_groove",
-    runs: Annotated[int, option("--runs", "N", "Number of calibrations, each in its own world.", min=10)] = 200,
-) -> Outcome:
-    """Calibrate with an imperfect scanner and arm, without rendering: errors at the work point, and how often they lie
-    in the stated 95 % region."""
-    folder = IMPERFECT.folder(call)
-    found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
-    return IMPERFECT.found(_imperfect(found), folder)
+    run.table("", ("", "found"), rows)

@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
-from tests.figures.harness import Figures, Row, Study, Target
+from tests.figures.harness import Row, Run, figure
 from tests.worlds.light_runs import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
 from tests.worlds.scaled_arms import perfect
 from weldcal.models.arrays import Array
@@ -18,9 +17,7 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import subplots, svg
-from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.weld import calibration_error
 
 SCENARIO = "calibrate_only"
@@ -130,88 +127,29 @@ def live_picture(rows: list[LiveRow]) -> bytes:
     return svg(figure, *axes)
 
 
-def live_figures(rows: Sequence[LiveRow], scans: int, repeatability_mm: float) -> dict[str, object]:
-    """Errors against their targets and the Cramer-Rao bound, and with redrawn noise where there is some."""
+def live_rows(rows: Sequence[LiveRow]) -> Iterable[Row]:
+    """Errors beside the Cramer-Rao bound, and with redrawn noise where there is some."""
     again = joined([r.redrawn for r in rows])
-    work, least, expected = (
-        1e3 * np.array([getattr(r, k) for r in rows]) for k in ("at_work_m", "least_m", "expected_m")
-    )
+    work, least = (1e3 * np.array([getattr(r, k) for r in rows]) for k in ("at_work_m", "least_m"))
     turn, turn_least = (np.degrees([getattr(r, k) for r in rows]) for k in ("rotation_rad", "least_rad"))
-    at_work, rotation = ({"mean": v.mean(), "rms": _rms(v), "worst": v.max()} for v in (work, turn))
-    target_mm, target_deg = 1e3 * TARGET_M, float(np.degrees(TARGET_RAD))
-    figures: dict[str, object] = {
-        "seeds": len(rows),
-        "scans": scans,
-        "repeatability_mm": repeatability_mm,
-        "at_work_mm": at_work,
-        "rotation_deg": rotation,
-        "expected_mm": _rms(expected),
-        "bound_mm": _rms(least),
-        "bound_deg": _rms(turn_least),
-        "target_mm": target_mm,
-        "target_deg": target_deg,
-        "within": int(np.sum((work <= target_mm) & (turn <= target_deg))),
-        "rows": [{k: v for k, v in vars(r).items() if k != "redrawn"} for r in rows],
-    }
+    yield "at the work point, mm", *(f"{v:.3f}" for v in (work.mean(), _rms(work), work.max(), _rms(least)))
+    yield "rotation, deg", *(f"{v:.4f}" for v in (turn.mean(), _rms(turn), turn.max(), _rms(turn_least)))
     if len(again.at_work_m):
-        within, within_at_bound = again.within(TARGET_M, TARGET_RAD)
-        turns = np.degrees(again.rotation_rad)
-        figures["redrawn"] = {
-            "calibrations": len(again.at_work_m),
-            "rms_mm": _rms(1e3 * again.at_work_m),
-            "rms_deg": _rms(turns),
-            "p99_deg": float(np.percentile(turns, 99)),
-            "within": within,
-            "within_at_bound": within_at_bound,
-        }
-    return figures
+        within, at_bound = again.within(TARGET_M, TARGET_RAD)
+        redrawn, turns = _rms(1e3 * again.at_work_m), _rms(np.degrees(again.rotation_rad))
+        yield "new noise, at the work point, mm", "", f"{redrawn:.3f}", "", f"{_rms(least):.3f}"
+        yield "new noise, rotation, deg", "", f"{turns:.4f}", "", f"{_rms(turn_least):.4f}"
+        yield "new noise, both within the targets", "", f"{100 * within:.1f} %", "", f"{100 * at_bound:.1f} %"
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _live_rows(f: Figures) -> Iterable[Row]:
-    e, t = f["at_work_mm"], f["rotation_deg"]
-    yield "at the work point, mm", *(f"{e[k]:.3f}" for k in ("mean", "rms", "worst")), f"{f['bound_mm']:.3f}"
-    yield "rotation, deg", *(f"{t[k]:.4f}" for k in ("mean", "rms", "worst")), f"{f['bound_deg']:.4f}"
-    if again := f.get("redrawn"):
-        yield "new noise, at the work point, mm", "", f"{again['rms_mm']:.3f}", "", f"{f['bound_mm']:.3f}"
-        yield "new noise, rotation, deg", "", f"{again['rms_deg']:.4f}", "", f"{f['bound_deg']:.4f}"
-        shares = (f"{100 * again[k]:.1f} %" for k in ("within", "within_at_bound"))
-        yield "new noise, both within the targets", "", next(shares), "", next(shares)
-
-
-LIVE = Study(
-    name="flange-live",
-    what="The error of the live calibration in simulation, beside the least that its poses, arm and scanner allow.",
-    header=("error", "mean", "rms", "worst", "Cramer-Rao, rms"),
-    rows=_live_rows,
-    targets=lambda f: (
-        Target("at the work point", "mm", f["at_work_mm"]["worst"], f["target_mm"], over="worst", decides=False),
-        Target("rotation", "deg", f["rotation_deg"]["worst"], f["target_deg"], over="worst", decides=False),
-    ),
-    numbers=4,
-)
-
-
-@command("benchmark flange-live", short_help="Compare live calibrations with the Cramer-Rao bound.", hidden=True)
-def live(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of calibrations, each in its own world.", min=1)] = 10,
-    scans: Annotated[int, option("--scans", "N", "Scans of each calibration.", min=4, max=8)] = 8,
-    repeatability: Annotated[
-        float, option("--repeatability", "MM", "Repeatability of the arm: rms distance of the flange.", min=0.0)
-    ] = 0.05,
-    redraws: Annotated[
-        int, option("--redraws", "N", "Further calibrations from the poses of each, with new noise.", min=0)
-    ] = 50,
-) -> Outcome:
-    """Measure the error of the live calibration in simulation and compare with the Cramer-Rao bound."""
-    folder = LIVE.folder(call)
-    rows = study_live(
-        seeds, first=call.seed, scans=scans, repeatability_mm=repeatability, redraws=redraws, progress=call.progress
-    )
-    if redraws:
-        write_atomic(folder / "live.svg", live_picture(rows))
-    return LIVE.found(live_figures(rows, scans, repeatability), folder)
+@figure("flange-live", "the error of the live calibration beside the least that poses, arm and scanner allow")
+def live(run: Run) -> None:
+    """Calibrate live with eight scans (four in the quick form), and again with new noise."""
+    seeds, scans, redraws = run.size((1, 4, 5), (12, 8, 200))
+    rows = study_live(seeds, first=run.seed, scans=scans, redraws=redraws, progress=run.progress)
+    run.write("live.svg", live_picture(rows))
+    run.table("", ("error", "mean", "rms", "worst", "Cramer-Rao, rms"), live_rows(rows))

@@ -1,15 +1,14 @@
 """Calibrations from few of the recorded scans, judged on the others."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from pydrake.math import RigidTransform
 
-from tests.figures.harness import Figures, Row, Study
+from tests.figures.harness import Run, figure
+from tests.places import SHARED_DATA
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
@@ -24,7 +23,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import fixed, statistics
 
 SIZES = (1, 2, 3, 4, 6, 8, 12)
@@ -115,41 +113,15 @@ def _calibrated(
     return solve_jointly(used, patterns, seed=seed)
 
 
-DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="A dataset folder with scans.")]
-
-
-def _few(found: Sequence[Draws], draws: int) -> dict[str, object]:
+@figure("flange-few", "calibrations from few of the recorded scans, judged on the scans that were not used")
+def few(run: Run) -> None:
+    """Calibrate from 1, 2, 3, 4, 6, 8 or 12 scans of the AUBO, or of the dataset --data."""
+    folder = run.data or SHARED_DATA / "flange" / "aubo_i5_phoxi_s"
     rows = []
-    for r in (r for r in found if len(r.position_m) > 1):
-        of = statistics(1e3 * r.position_m, "median", "p95")
-        tilt = float(np.degrees(np.median(r.tilt_rad)))
-        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * median_sigma(r.position_m)}
-        rows.append(row | {"p95_mm": of["p95"], "tilt_deg": tilt, "corrected": r.corrected, "refused": r.refused})
-    return {"draws": draws, "rows": rows}
-
-
-def _few_rows(f: Figures) -> Iterable[Row]:
-    for r in f["rows"]:
-        error = f"{r['median_mm']:.3f} ± {r['median_sigma_mm']:.3f}"
-        share = f"{100 * r['corrected']:.0f} %"
-        yield str(r["scans"]), error, f"{r['p95_mm']:.3f}", fixed(r["tilt_deg"], 3), share, str(r["refused"])
-
-
-FEW = Study(
-    name="flange-few",
-    what="Calibrations from few of the recorded scans, judged on the scans that were not used.",
-    header=("scans", "median mm", "95 % mm", "tilt deg", "scanner corrected", "draws refused"),
-    rows=_few_rows,
-    numbers=5,
-)
-
-
-@command("benchmark flange-few", short_help="Calibrate from 1 to 12 of the scans.", hidden=True)
-def few(
-    call: Call,
-    dataset: DatasetArgument,
-    draws: Annotated[int, option("--draws", "N", "Number of random draws of each size.", min=2)] = 60,
-) -> Outcome:
-    """Calibrate from 1, 2, 3, 4, 6, 8 or 12 of the scans and measure the error on the scans that were not used."""
-    folder, found = FEW.folder(call), study_few_scans(dataset, draws, call.seed, progress=call.progress)
-    return FEW.found(_few(found, draws), folder)
+    for r in study_few_scans(folder, run.size(6, 60), run.seed, progress=run.progress):
+        if len(r.position_m) > 1:
+            of = statistics(1e3 * r.position_m, "median", "p95")
+            median = f"{of['median']:.3f} ± {1e3 * median_sigma(r.position_m):.3f}"
+            tilt = fixed(float(np.degrees(np.median(r.tilt_rad))), 3)
+            rows.append((str(r.scans), median, f"{of['p95']:.3f}", tilt, f"{100 * r.corrected:.0f} %", str(r.refused)))
+    run.table("", ("scans", "median mm", "95 % mm", "tilt deg", "scanner corrected", "draws refused"), rows)

@@ -1,16 +1,11 @@
 """Compare hand-eye solvers with OpenCV on public data and in simulation."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 
-from tests.figures.hand_eye.cells import hand_eye_cells, mountings
-from tests.figures.hand_eye.cells import hand_eye_pictures as pictures
-from tests.figures.harness import Figures, Row, Study, Table
-from tests.figures.subject import one_of
+from tests.figures.harness import Run, figure
 from tests.worlds.hand_eye import fuzz
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.hand_eye.corners import refine_with_corners
@@ -20,7 +15,6 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
 from weldcal.tools.report.render import fixed
 
 _SHARE = 0.02  # by which a method must be better to count as ahead
@@ -63,28 +57,6 @@ class HandEyeBenchmark:
 
     rows: list[DatasetRow] = field(default_factory=list)
     checks: dict[str, tuple[bool, str]] = field(default_factory=dict)
-
-    def summary(self) -> dict[str, Any]:
-        """For the last line of --json."""
-        return {
-            "datasets": {
-                r.name: {
-                    "held_out_deg": r.deg,
-                    "held_out_mm": r.mm,
-                    "best_opencv_deg": r.best_deg,
-                    "best_opencv_mm": r.best_mm,
-                    "lowest_ratio_deg": r.low_deg,
-                    "lowest_ratio_mm": r.low_mm,
-                    "holds": r.holds,
-                    "flagged": list(r.flagged),
-                    "unobservable": list(r.unobservable),
-                    "truth_nees": r.truth_nees,
-                    "truth_nees_corners": r.truth_nees_corners,
-                }
-                for r in self.rows
-            },
-            "checks": {k: {"holds": ok, "seen": text} for k, (ok, text) in self.checks.items()},
-        }
 
 
 def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: bool = True) -> DatasetRow:
@@ -164,61 +136,20 @@ def run_hand_eye_benchmark(
     return report
 
 
-def _set_rows(figures: Figures) -> Iterable[Row]:
-    for name, r in figures["datasets"].items():
-        known = r["best_opencv_deg"] is not None and np.isfinite(r["best_opencv_deg"])
-        yield (
-            name,
-            f"{r['held_out_deg']:.4f}",
-            fixed(r["best_opencv_deg"], 4),
-            f"{r['held_out_mm']:.3f}",
-            fixed(r["best_opencv_mm"], 3),
-            ", ".join(map(str, r["flagged"])) or "-",
-            "; ".join(r["unobservable"]) or "-",
-            ("yes" if r["holds"] else "NO") if known else "-",
-            f"{fixed(r['truth_nees'], 1)}, {fixed(r['truth_nees_corners'], 1)}",
+@figure("hand-eye", "the hand-eye solvers beside OpenCV's seven methods on public sets (--data), and in simulation")
+def hand_eye(run: Run) -> None:
+    """Compare the solvers with OpenCV's on public data, and test them in simulated worlds."""
+    found = run_hand_eye_benchmark(run.data, quick=not run.full, seed=run.seed, progress=run.progress)
+    rows = (
+        (
+            *(r.name, f"{r.deg:.4f}", fixed(r.best_deg, 4), f"{r.mm:.3f}", fixed(r.best_mm, 3)),
+            *(", ".join(map(str, r.flagged)) or "-", "; ".join(r.unobservable) or "-"),
+            ("yes" if r.holds else "NO") if np.isfinite(r.best_deg) else "-",
+            f"{fixed(r.truth_nees, 1)}, {fixed(r.truth_nees_corners, 1)}",
         )
-
-
-def _checks(figures: Figures) -> Iterable[Table]:
-    rows = [(name, "yes" if c["holds"] else "NO", c["seen"]) for name, c in figures["checks"].items()]
-    yield "In simulation", ("check", "holds", "found"), rows
-
-
-SETS = Study(
-    name="hand-eye",
-    what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
-    rows=_set_rows,
-    others=_checks,
-    header=(
-        "set",
-        "held-out deg",
-        "best OpenCV",
-        "held-out mm",
-        "best OpenCV",
-        "flagged",
-        "open",
-        "holds",
-        "squared error against the truth, with corners",
-    ),
-)
-
-
-@command("benchmark hand-eye-sets", short_help="Compare the hand-eye solvers with OpenCV's on sets.", hidden=True)
-def hand_eye_sets(
-    call: Call,
-    data: Annotated[Path | None, option("--data", "FOLDER", "A folder of sets, each a folder with pairs.npz.")] = None,
-    quick: Annotated[bool, switch("--quick", "Few trials of each kind: seconds instead of minutes.")] = False,
-) -> Outcome:
-    """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation."""
-    folder = SETS.folder(call)
-    found = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
-    return SETS.found(found.summary(), folder)
-
-
-@command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)
-@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, pictures=pictures)
-def hand_eye(call: Call) -> None:
-    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in
-    simulation, calibrate every mounting live (mountings), and calibrate from rendered pictures (pictures).
-    """
+        for r in found.rows
+    )
+    held = ("held-out deg", "best OpenCV", "held-out mm", "best OpenCV")
+    run.table("", ("set", *held, "flagged", "open", "holds", "squared error against the truth, with corners"), rows)
+    checks = ((name, "yes" if ok else "NO", text) for name, (ok, text) in found.checks.items())
+    run.table("In simulation", ("check", "holds", "found"), checks)

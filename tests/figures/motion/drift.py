@@ -1,23 +1,14 @@
 """Jumps, creeps and quiet hours of a monitored calibration, on a world of features."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.math import RigidTransform
-from scipy.stats import ncx2
 
-from tests.figures.harness import Cases, Figures, Results, Row, Study, Target, all_met, whole
-from tests.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
-from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter
-from weldcal.calibration.motion.drift.residuals import CLOCK
+from tests.figures.harness import Run, figure
+from tests.worlds.moves import Change, WorldConfig, simulate
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
+from weldcal.tools.report.render import fixed, statistics
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0
@@ -28,20 +19,10 @@ _CREEP_START_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class DriftTrial:
-    """One recording with one change: what, when found (s after it; NaN: not), and how well measured.
-
-    ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of
-    the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
-    threshold. ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
-    change was, in the same units.
-    """
+    """One recording with one change: what, when found (s after it; NaN: not), and how well measured."""
 
     kind: str
-    seed: int
-    along_view: float
     false_alarms: int
-    shown: float
-    told: float
     found_after_s: float = float("nan")
     time_error_s: float = float("nan")
     translation_error_mm: float = float("nan")
@@ -49,123 +30,34 @@ class DriftTrial:
     named: str = ""
 
 
-def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapping[str, object]:
-    """Watch one recording: a ``kind`` of change as a Trial, or "quiet" hours in which nothing happens."""
-    world = WorldConfig(stamps=stamps)
-    if kind != "quiet":
-        return asdict(creep_trial(world, seed) if kind == "creep" else knock_trial(world, seed, turn=kind == "turn"))
-    alarmed, largest, threshold = quiet_hours(world, hours, seed)
-    return {
-        "kind": kind,
-        "stamps": stamps,
-        "hours": hours,
-        "largest_statistic": largest,
-        "threshold": threshold,
-        "alarmed": [
-            {
-                "kind": e.kind,
-                "time_s": e.time_s,
-                "found_s": e.found_s,
-                "statistic": e.statistic,
-                "model": e.model,
-                "translation_mm": (1e3 * e.translation_m).tolist(),
-                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
-            }
-            for e in alarmed
-        ],
-    }
-
-
-def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
-    """Return jumps, of which every other one shifts and turns, creeps, and one recording of quiet hours."""
-    kinds = [("turn" if k % 2 else "shift", seed + k) for k in range(knocks)]
-    kinds += [("creep", seed + 5000 + k) for k in range(creeps)]
-    out: dict[str, dict[str, Any]] = {f"{kind} {n}": {"kind": kind, "seed": n, "stamps": stamps} for kind, n in kinds}
-    return out | {"quiet": {"kind": "quiet", "seed": seed + 9000, "stamps": stamps, "hours": hours}}
-
-
-def _figures(results: Results) -> Figures:
-    quiet = whole(results)["quiet"]
-    trials = [DriftTrial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
-    knocks = [t for t in trials if t.kind != "creep"]
-    found = np.array([t.found_after_s for t in knocks])
-    creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
-    reached = 1e3 * CREEP_M_S * np.where(np.isnan(creeps), np.inf, creeps)
-    early, hours = sum(t.false_alarms for t in trials), quiet["hours"]
-    targets = [
-        Target(f"knocks found within {WITHIN_S:g} s", "%", _percent(found <= WITHIN_S), 100.0, "≥"),
-        Target(f"false alarms in {hours:g} quiet hours", "", float(len(quiet["alarmed"])), 0.0),
-        Target("false alarms before a change", "", float(early), 0.0),
-        Target("creep when found", "mm", float(reached.max(initial=0.0)), 1e3 * CREEP_MOST_M, over="worst"),
-    ]
-    return {
-        "state": "done" if all_met(targets) else "failed",
-        "stamps": quiet["stamps"],
-        "knocks": len(knocks),
-        "found_within_2_s": int((found <= WITHIN_S).sum()),
-        "found": int(np.isfinite(found).sum()),
-        "found_after_s": _spread(found),
-        "time_error_s": _spread(np.abs(np.array([t.time_error_s for t in knocks]))),
-        "translation_error_mm": _spread(np.array([t.translation_error_mm for t in knocks if t.kind == "shift"])),
-        "rotation_error_deg": _spread(np.array([t.rotation_error_deg for t in knocks if t.kind == "turn"])),
-        "named_right": sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in knocks),
-        "expected_late": expected_late(knocks),
-        "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
-        "turns_by_angle_to_the_view": found_by_angle(knocks),
-        "creep_mm_when_found": reached.tolist(),
-        "quiet_hours": hours,
-        "false_alarms": len(quiet["alarmed"]),
-        "alarmed": quiet["alarmed"],
-        "largest_statistic": quiet["largest_statistic"],
-        "threshold": quiet["threshold"],
-        "targets": [{**t._asdict(), "met": t.met} for t in targets],
-    }
-
-
-def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a trial's fields; JSON has null for NaN."""
-    return {name: float("nan") if value is None else value for name, value in result.items()}
-
-
-def _targets(figures: Figures) -> list[Target]:
-    return [Target(**{name: t[name] for name in Target._fields}) for t in figures["targets"]]
-
-
-def _rows(figures: Figures) -> Iterable[Row]:
-    for r in figures["turns_by_angle_to_the_view"]:
-        found, shown = r["found_within_2_s_percent"], r["shown_median"]
-        yield f"{r['from_deg']:g} to {r['to_deg']:g}", f"{r['turns']}", f"{found:.0f}", f"{shown:.3g}"
-
-
-STUDY = Study(
-    name="drift",
-    what=(
-        "How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet"
-        " hours."
-    ),
-    case=one_recording,
-    figures=_figures,
-    header=("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds"),
-    rows=_rows,
-    targets=_targets,
-    numbers=3,
-)
-
-
-@command("benchmark drift", short_help="Measure how soon a moved scanner is found.", options=FARM, hidden=True)
-def benchmark_drift(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
-    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
-    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
-    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
-    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
-) -> Outcome:
-    """Measure the drift test: how soon jumps of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
-    if stamps not in ("device", "arrival"):
-        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
-    size = (2, 1, 0.01) if quick else (runs, creeps, hours)
-    return STUDY.outcome(call, cases(*size, stamps, call.seed))
+@figure("drift", "how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms in quiet hours")
+def drift(run: Run) -> None:
+    """Measure the drift test on a world of features."""
+    (knocks, creeps, hours), world = run.size((2, 1, 0.01), (200, 8, 10.0)), WorldConfig()
+    trials = []
+    for k in range(knocks):
+        run.progress("knocks", k / knocks)
+        trials.append(knock_trial(world, run.seed + k, turn=bool(k % 2)))
+    found = np.array([t.found_after_s for t in trials])
+    slow = [creep_trial(world, run.seed + 5000 + k) for k in range(creeps)]
+    reached = 1e3 * CREEP_M_S * np.array([t.found_after_s for t in slow])
+    quiet, largest = watched(world, 3600.0 * hours, run.seed + 9000)
+    right = sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in trials)
+    shifts = [t.translation_error_mm for t in trials if t.kind == "shift"]
+    turns = [t.rotation_error_deg for t in trials if t.kind == "turn"]
+    rows = (
+        (f"knocks found within {WITHIN_S:g} s", f"{(found <= WITHIN_S).sum()} of {knocks}"),
+        ("knocks named right", f"{right} of {knocks}"),
+        ("found after, s: median, 95 %, worst", _spread(found)),
+        ("time off, s", _spread(np.abs([t.time_error_s for t in trials]))),
+        ("shift off, mm", _spread(np.array(shifts))),
+        ("turn off, deg", _spread(np.array(turns))),
+        ("creep when found, mm", _spread(reached)),
+        (f"false alarms in {hours:g} quiet hours", str(len(quiet.events))),
+        ("false alarms before a change", str(sum(t.false_alarms for t in (*trials, *slow)))),
+        ("largest statistic in quiet hours, of its threshold", f"{largest / quiet.threshold:.2f}"),
+    )
+    run.table("", ("", "found"), rows)
 
 
 def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
@@ -176,8 +68,8 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
     at = float(rng.uniform(*_KNOCK_S))
     shift, rotation = (np.zeros(3), TURN_RAD * axis) if turn else (SHIFT_M * axis, np.zeros(3))
     change = Change(at, tuple(shift.tolist()), tuple(rotation.tolist()))
-    events, view, *said = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed, (at, shift, rotation))
-    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), *said)
+    test, _ = watched(replace(world, changes=(change,)), at + _AFTER_S, seed)
+    return _trial("turn" if turn else "shift", test.events, at, shift, rotation)
 
 
 def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
@@ -189,138 +81,24 @@ def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
     shift = CREEP_MOST_M * axis
     change = Change(_CREEP_START_S, tuple(shift.tolist()), over_s=over)
     slow = replace(world, frame_s=8.0 * world.frame_s, changes=(change,))
-    events, view, _, _ = _watched(slow, _CREEP_START_S + over, seed, (0.0, shift, np.zeros(3)))
-    said = (float("nan"), float("nan"))
-    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)), *said)
+    test, _ = watched(slow, _CREEP_START_S + over, seed)
+    return _trial("creep", test.events, _CREEP_START_S, shift, np.zeros(3))
 
 
-def quiet_hours(world: WorldConfig, hours: float, seed: int) -> tuple[list[DriftEvent], float, float]:
-    """False alarms, the largest statistic and the threshold over hours in which nothing happens."""
-    w = simulate(world, 3600.0 * hours, seed)
-    test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / world.frame_s)
+def watched(config: WorldConfig, duration_s: float, seed: int) -> tuple[DriftTest, float]:
+    """Return the test after a recording, and its largest statistic."""
+    w = simulate(config, duration_s, seed)
+    test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
     largest = 0.0
     for k in range(len(w.rows)):
         test.update(w.rows.part(slice(k, k + 1)))
         largest = max(largest, test.statistic)
     test.finish()
-    return test.events, largest, test.threshold
+    return test, largest
 
 
-def _watched(
-    config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
-) -> tuple[list[DriftEvent], Array, float, float]:
-    """Return events of a recording, the line of sight in the base, and what its frames show of a change.
-
-    The change is (time s, shift m, rotation rad); shown to a test that knows everything else, and to one that knows
-    what the monitor does.
-    """
-    w = simulate(config, duration_s, seed)
-    test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
-    before: DriftFilter | None = None
-    for k in range(len(w.rows)):
-        if before is None and w.rows.times[k] >= change[0]:
-            before = test.filter.copy()
-        test.update(w.rows.part(slice(k, k + 1)))
-    test.finish()
-    told = float("nan") if before is None else _told(w, test, before, change)
-    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change), told
-
-
-def expected_late(knocks: Sequence[DriftTrial]) -> float:
-    """Count changes that noise alone hides for WITHIN_S from a test of three unknowns that knows their times."""
-    threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
-    return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
-
-
-def _moved(w: FeatureWorld, change: tuple[float, Array, Array]) -> Array:
-    """Return a change [rotation; translation] (6,) about the pivot."""
-    _, shift, rotation = change
-    return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
-
-
-def _within(w: FeatureWorld, at: float) -> NDArray[np.intp]:
-    """Return the frames of WITHIN_S after a time."""
-    return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
-
-
-def _without_clock(information: Array) -> Array:
-    """Information (6, 6) of a move, where the clock may be other as well."""
-    N, c = information, CLOCK
-    return np.asarray(N[:c, :c] - np.outer(N[:c, c], N[c, :c]) / N[c, c])
-
-
-def _shown(w: FeatureWorld, test: DriftTest, change: tuple[float, Array, Array]) -> float:
-    """Compute the expected statistic of a pure shift or turn by the frames of WITHIN_S, over its threshold.
-
-    Noise and all other errors are known exactly, and the clock alone is not.
-    """
-    chosen = _within(w, change[0])
-    if not len(chosen) or test.noise is None:
-        return float("nan")
-    H = w.rows.derivatives[chosen][:, :, : CLOCK + 1]
-    motion = w.rows.derivatives[chosen][:, :, CLOCK]
-    noise = test.noise
-    R = np.array([noise.covariance(S, u) for S, u in zip(w.rows.covariances[chosen], motion, strict=True)])
-    N = np.einsum("nia,nij,njb->ab", H, np.linalg.inv(R), H)
-    move = _moved(w, change)
-    return float(move @ _without_clock(N) @ move) / test.threshold_alone
-
-
-def _told(w: FeatureWorld, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
-    """Compute it with all other errors known as by the monitor's filter ``before`` the change, and its time."""
-    chosen = _within(w, change[0])
-    if not len(chosen) or test.noise is None:
-        return float("nan")
-    before.spawn(change[0], (STEP,))
-    (slot,) = np.flatnonzero(before.used)
-    for k in chosen:
-        before.update(w.rows, int(k), test.noise, spawn=False)
-    move, c = _moved(w, change), test.config
-    floor = np.repeat([c.floor_rad**2, c.floor_m**2], 3)
-    known = float(move @ _without_clock(before.information[slot]) @ move)
-    if known <= 0.0:
-        return 0.0
-    return 1.0 / (1.0 / known + 1.0 / float(move @ (move / floor))) / test.threshold_alone
-
-
-def found_by_angle(trials: Sequence[DriftTrial]) -> list[dict[str, float]]:
-    """Group turns by the angle of their axis to the line of sight.
-
-    How many there were, the share found within WITHIN_S, and the median of what the frames show.
-    """
-    turns = [t for t in trials if t.kind == "turn"]
-    angles = np.degrees(np.arccos(np.clip([t.along_view for t in turns], 0.0, 1.0)))
-    rows = []
-    for low, high in pairwise((0.0, 10.0, 20.0, 30.0, 45.0, 90.0)):
-        part = [t for t, a in zip(turns, angles, strict=True) if low <= a < high or a == high == 90.0]
-        if part:
-            found = np.array([t.found_after_s for t in part])
-            rows.append(
-                {
-                    "from_deg": low,
-                    "to_deg": high,
-                    "turns": len(part),
-                    "found_within_2_s_percent": _percent(found <= WITHIN_S),
-                    "shown_median": float(np.median([t.shown for t in part])),
-                    "shown_least": float(min(t.shown for t in part)),
-                }
-            )
-    return rows
-
-
-def _trial(
-    kind: str,
-    seed: int,
-    events: list[DriftEvent],
-    at: float,
-    shift: Array,
-    rotation: Array,
-    view: float,
-    shown: float,
-    told: float,
-) -> DriftTrial:
-    early = sum(e.found_s < at for e in events)
-    missed = DriftTrial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
+def _trial(kind: str, events: list[DriftEvent], at: float, shift: Array, rotation: Array) -> DriftTrial:
+    missed = DriftTrial(kind=kind, false_alarms=sum(e.found_s < at for e in events))
     for e in (e for e in events if e.found_s >= at):
         return replace(
             missed,
@@ -333,12 +111,5 @@ def _trial(
     return missed
 
 
-def _percent(hits: NDArray[np.bool_]) -> float:
-    return 100.0 * float(np.mean(hits)) if len(hits) else float("nan")
-
-
-def _spread(values: Array) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return {}
-    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95.0)), "worst": float(known.max())}
+def _spread(values: Array) -> str:
+    return ", ".join(fixed(v, 4) for v in statistics(values, "median", "p95", "max").values())

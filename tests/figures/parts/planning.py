@@ -4,18 +4,16 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
+from tests.figures.harness import Run, figure
 from tests.worlds.parts.scans import PLANNED, REFUSED, TROUBLES, WIDEST_PX, Scene, Trouble, scan, scan_part, sideways
 from weldcal.models.errors import WeldcalError
 from weldcal.models.scanners import SCANNERS, get_scanner
 from weldcal.models.workpieces.plate import Workpiece
-from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.render import mappings_csv, write_atomic
+from weldcal.tools.console import Progress
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats
@@ -119,68 +117,27 @@ def trouble_trial(trouble: Trouble, seed: int) -> Plan:
     return {"name": trouble.name, "method": trouble.method, "seed": seed, "ok": ok, **plan}
 
 
-def run_seam_planning_benchmark(
-    out: Path,
-    runs: int = 2,
-    seed: int = 0,
-    presets: list[str] | None = None,
-    progress: Progress = no_progress,
-    *,
-    full: bool = False,
-    troubles: bool = True,
-) -> tuple[dict[str, object], dict[str, str]]:
-    """Every preset, shape and method over `runs` held-out poses: trials.csv in `out`, and the rows of the table.
-
-    full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well
-    (troubles.csv).
-    """
-    presets = list(SCANNERS) if presets is None else presets
-    trials: list[Plan] = []
-    total = len(presets) * len(SHAPES) * runs
-    for preset in presets:
-        for shape in SHAPES:
-            for k in range(runs):
-                number = FIRST_HELD_OUT + seed + k
-                scene = scan(preset, shape, number, None if full else WIDEST_PX)
+def plans_of(
+    presets: Sequence[str], runs: int, seed: int, progress: Progress, shapes: Sequence[str] = SHAPES
+) -> list[Plan]:
+    """Plan every preset, shape and method over ``runs`` held-out poses."""
+    plans: list[Plan] = []
+    for k, preset in enumerate(presets):
+        for shape in shapes:
+            progress(f"{preset}, {shape}", k / len(presets))
+            for number in range(FIRST_HELD_OUT + seed, FIRST_HELD_OUT + seed + runs):
+                scene = scan(preset, shape, number, WIDEST_PX)
                 named = {"preset": preset, "shape": shape, "seed": number}
-                for method, plan in METHODS.items():
-                    trials.append({**named, "method": method, **figures(partial(plan, scene))})
-                progress("planning", len(trials) / (len(METHODS) * total))
-                write_atomic(out / "trials.csv", mappings_csv(trials))
-    rows = plan_rows(trials, "preset")
-    if troubles:
-        cases = [trouble_trial(trouble, FIRST_HELD_OUT + seed + k) for trouble in TROUBLES for k in range(runs)]
-        write_atomic(out / "troubles.csv", mappings_csv(cases))
-        rows |= plan_rows(cases, "name")
-    done = [t for t in trials if not t["refused"]]
-    summary: dict[str, object] = {
-        "state": "done",
-        "trials": len(trials),
-        "planned": len(done),
-        "worst_mm": max((t["worst_mm"] for t in done), default=math.nan),
-        "most_seconds": max((t["seconds"] for t in trials), default=math.nan),
-    }
-    return summary, rows
+                plans += [{**named, "method": m, **figures(partial(plan, scene))} for m, plan in METHODS.items()]
+    return plans
 
 
-@command("benchmark seam-planning", short_help="Measure the error of a seam planned from one scan.", hidden=True)
-def planning(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Random poses of each part.", min=1)] = 2,
-    preset: Annotated[
-        list[str] | None, option("--preset", "NAME", "A scanner; repeat for more.", show_default="all")
-    ] = None,
-    full: Annotated[
-        bool, switch("--full-resolution", "Images of the scanner's full width, not 824 pixels at most.")
-    ] = False,
-    troubles: Annotated[
-        bool, switch("--troubles/--no-troubles", "Also test occlusion, clutter and wrong workpieces.")
-    ] = True,
-) -> Outcome:
-    """Measure the error of a seam planned from one scan, with and without a drawing, for each scanner."""
-    folder = call.folder("benchmark", "seam-planning")
-    names = [get_scanner(name).name for name in preset] if preset else None
-    summary, rows = run_seam_planning_benchmark(
-        folder, runs, call.seed, names, call.progress, full=full, troubles=troubles
-    )
-    return Outcome(summary, rows=rows)
+@figure("seam-planning", "the error of a seam planned from one scan, with and without a drawing, for each scanner")
+def planning(run: Run) -> None:
+    """Plan seams in random poses, and in hard cases: occlusion, clutter and wrong workpieces."""
+    runs = run.size(1, 5)
+    rows = plan_rows(plans_of(run.size((PRESET,), tuple(SCANNERS)), runs, run.seed, run.progress), "preset")
+    if run.full:
+        seeds = range(FIRST_HELD_OUT + run.seed, FIRST_HELD_OUT + run.seed + runs)
+        rows |= plan_rows([trouble_trial(trouble, seed) for trouble in TROUBLES for seed in seeds], "name")
+    run.table("", ("scans", "found"), rows.items())

@@ -5,8 +5,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +14,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from tests.figures.harness import Run, figure
 from tests.worlds.parts.scans import REFUSALS, PartScene, Subject, scan_scene, subject
 from tests.worlds.parts.step_parts import PARTS
 from weldcal.models.errors import WeldcalError
 from weldcal.models.scanners import get_scanner
-from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.render import mappings_csv, write_atomic
+from weldcal.tools.report.render import mappings_csv
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part
 from weldcal.welding.locate.part.result import AmbiguousPart, PartNotFound, PartRegistration
@@ -32,6 +30,7 @@ Floats = NDArray[np.float64]
 
 NEES_BOUND = float(chi2.ppf(0.9973, 6))  # of a pose within 3 sigma
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.3, 0.8
+WORST = ("nees", "seam_mean_mm", "seam_max_mm", "cpu_s")
 SAME_SURFACE_M = 1e-4
 HINT_M, HINT_RAD = 0.04, math.radians(15.0)
 SCENES: dict[str, Mapping[str, object]] = {
@@ -58,16 +57,16 @@ def plan_trials(seeds: Sequence[int], names: Sequence[str]) -> list[Trial]:
     return [("plan", name, seed, True) for name in names for seed in seeds]
 
 
-def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
+def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, Any]:
     """Scan, register and judge; a row of the table."""
     part = subject(name)
     scanner = get_scanner("phoxi_m", 824)
     number = 1000 * list(PARTS).index(name) + seed
-    options: dict[str, object] = {"objects": 4, "fingers": 1} if kind == "plan" else dict(SCENES[kind])
-    scene: PartScene = scan_scene(part.mesh, scanner, number, **options)  # type: ignore[arg-type]
+    options: dict[str, Any] = {"objects": 4, "fingers": 1} if kind == "plan" else dict(SCENES[kind])
+    scene: PartScene = scan_scene(part.mesh, scanner, number, **options)
     rng = np.random.default_rng([seed, 1803])
     off = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3) * HINT_RAD), rng.uniform(-1.0, 1.0, 3) * HINT_M)
-    row: dict[str, object] = {"kind": kind, "part": name, "seed": seed}
+    row: dict[str, Any] = {"kind": kind, "part": name, "seed": seed}
     start = time.process_time()
     try:
         found, joint = locate_part(
@@ -121,13 +120,13 @@ def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float
     return min(values)
 
 
-def run_refusal(name: str, seed: int) -> dict[str, object]:
+def run_refusal(name: str, seed: int) -> dict[str, Any]:
     """A subject that must be refused: right when it is, by the error and the words that name why."""
     case = REFUSALS[name]()
     scene = scan_scene(
         case.there, get_scanner("phoxi_m", 824), 50_000 + seed, objects=3, fingers=0, spread_m=0.02, twice=case.twice
     )
-    row: dict[str, object] = {"kind": "to refuse", "part": name, "seed": seed}
+    row: dict[str, Any] = {"kind": "to refuse", "part": name, "seed": seed}
     start = time.process_time()
     try:
         found = register_part(scene.cloud_B, case.looked_for, eye_B=scene.eye_B)
@@ -138,84 +137,37 @@ def run_refusal(name: str, seed: int) -> dict[str, object]:
     return {**row, "cpu_s": time.process_time() - start}
 
 
-def run_registration_study(
-    out: Path,
-    seeds: range,
-    plans: range,
-    refusals: range,
-    names: Sequence[str] | None = None,
-    progress: Progress = no_progress,
-) -> Mapping[str, object]:
-    """Run scenes with clutter, plans of every part, and subjects to refuse; registrations.csv grows.
+def summed(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Count right, refused and wrong by kind of scene, with the worst figures of those that are right.
 
-    Returns counts, worst figures and the verdict: done when nothing was wrong and the plans are within their targets.
+    Plans beyond the targets of the seam count as wrong.
     """
-    chosen = list(PARTS) if names is None else list(names)
-    jobs: list[Callable[[], dict[str, object]]] = []
-    jobs += [partial(run, *trial) for trial in clutter_trials(list(seeds)) if trial[1] in chosen]
-    jobs += [partial(run, *trial) for trial in plan_trials(list(plans), chosen)]
-    jobs += [partial(run_refusal, name, seed) for name in REFUSALS for seed in refusals]
-    rows: list[dict[str, object]] = []
+    found: dict[str, dict[str, float]] = {}
+    for kind in ("clutter", "plan", "to refuse"):
+        some = [row for row in rows if row["kind"] == kind or (kind == "clutter" and row["kind"] in SCENES)]
+        good = [row for row in some if row["verdict"] == "right"]
+        far = [r for r in good if r["seam_mean_mm"] > MEAN_TARGET_MM or r["seam_max_mm"] > MAX_TARGET_MM]
+        refused = sum(row["verdict"].startswith("refused") for row in some)
+        wrong = len(some) - len(good) - refused + (len(far) if kind == "plan" else 0)
+        worst = {f"worst {key}": max(row[key] for row in good) for key in WORST} if good else {}
+        found[kind] = {"scenes": len(some), "right": len(good), "refused": refused, "wrong": wrong, **worst}
+    return found
+
+
+@figure("part-registration", "twelve parts from STEP files found in their scans: right, refused, wrong, and errors")
+def registration(run_: Run) -> None:
+    """Register parts in scenes with clutter, plan their seams, and give subjects that must be refused."""
+    scenes, plans, refusals = run_.size((1, 1, 0), (40, 3, 3))
+    first = range(run_.seed, run_.seed + scenes)
+    names = run_.size(("lap",), tuple(PARTS))
+    jobs: list[Callable[[], dict[str, Any]]] = []
+    jobs += [partial(run, *trial) for trial in clutter_trials(list(first))]
+    jobs += [partial(run, *trial) for trial in plan_trials(range(run_.seed, run_.seed + plans), names)]
+    jobs += [partial(run_refusal, name, seed) for name in REFUSALS for seed in range(run_.seed, run_.seed + refusals)]
+    rows: list[dict[str, Any]] = []
     for k, job in enumerate(jobs):
+        run_.progress("parts", k / len(jobs))
         rows.append(job())
-        write_atomic(out / "registrations.csv", mappings_csv(rows))
-        progress(f"{rows[-1]['kind']}: {rows[-1]['part']}", (k + 1) / len(jobs))
-    return _summed(rows)
-
-
-def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
-    def of(some: list[dict[str, object]], key: str) -> Floats:
-        return np.array([value for row in some if isinstance(value := row.get(key), float)])
-
-    kinds = {
-        "clutter": [row for row in rows if row["kind"] in SCENES],
-        "plan": [row for row in rows if row["kind"] == "plan"],
-        "to_refuse": [row for row in rows if row["kind"] == "to refuse"],
-    }
-    summary: dict[str, object] = {}
-    fine = True
-    for kind, some in kinds.items():
-        verdicts = [str(row["verdict"]) for row in some]
-        refused = sum(v.startswith("refused") for v in verdicts)
-        right = verdicts.count("right")
-        wrong = len(some) - right - refused
-        fine &= wrong == 0
-        summary[kind] = {"scenes": len(some), "right": right, "refused": refused, "wrong": wrong}
-        if kind != "to_refuse" and right:
-            nees = of(some, "nees")
-            summary[kind] = {
-                **dict(summary[kind]),  # type: ignore[call-overload]
-                "nees_mean": float(nees.mean()),
-                "nees_max": float(nees.max()),
-                "seam_mean_mm": float(of(some, "seam_mean_mm").max()),
-                "seam_max_mm": float(of(some, "seam_max_mm").max()),
-            }
-    plans = kinds["plan"]
-    within = sum(
-        isinstance(row.get("seam_mean_mm"), float)
-        and float(str(row["seam_mean_mm"])) <= MEAN_TARGET_MM
-        and float(str(row["seam_max_mm"])) <= MAX_TARGET_MM
-        for row in plans
-    )
-    cpu = of(rows, "cpu_s")
-    return {
-        "state": "done" if fine and within == len(plans) else "held",
-        **summary,
-        "plans_within_targets": int(within),
-        "cpu_s_median": float(np.median(cpu)) if len(cpu) else None,
-        "cpu_s_max": float(cpu.max()) if len(cpu) else None,
-    }
-
-
-@command("benchmark part-registration", short_help="Register twelve parts from STEP files in their scans.", hidden=True)
-def registration(
-    call: Call,
-    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
-    scenes: Annotated[int, option("--scenes", "N", "Scenes with clutter, without a guess.", min=0)] = 40,
-    plans: Annotated[int, option("--plans", "N", "Plans of each part's seam, seeds from --seed on.", min=0)] = 3,
-    refusals: Annotated[int, option("--refusals", "N", "Scenes of each subject that must be refused.", min=0)] = 3,
-) -> Outcome:
-    """Register twelve parts from STEP files in simulated scans, plan their seams, and compare both with the truth."""
-    folder = call.folder("benchmark", "part-registration")
-    first, second, third = (range(call.seed, call.seed + count) for count in (scenes, plans, refusals))
-    return Outcome(run_registration_study(folder, first, second, third, part, call.progress))
+    run_.write("registrations.csv", mappings_csv(rows))
+    for kind, found in summed(rows).items():
+        run_.table(kind, ("figure", "found"), ((name, f"{v:.3g}") for name, v in found.items()))

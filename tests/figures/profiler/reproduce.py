@@ -1,15 +1,14 @@
 """reproduce profiler: the tables of both papers and the joint method, and the targets of the fixed files alone."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tests.figures.harness import Figures, Row, Study, Table, Target, all_met
+from tests.figures.harness import Missed, Row, Run, figure
 from tests.figures.profiler import papers
 from tests.figures.profiler.papers import (
     SEAM_FEATURES,
@@ -45,7 +44,6 @@ from weldcal.calibration.profiler.sphere.arc import find_arc
 from weldcal.calibration.profiler.sphere.joint import leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import fixed
 
@@ -74,6 +72,15 @@ SOLVED = (0.31, 0.30)  # deg, mm: farther off, the paper's method, which states 
 SILENT = 22.5  # normalised error squared that one sound answer of a thousand exceeds (chi-square, 6 degrees)
 FEATURES = (0.02, 0.035, 0.02)
 PUBLISHED = {SPHERE_METHODS[0]: 4.523, SPHERE_METHODS[1]: 0.840}
+
+
+class Target(NamedTuple):
+    """A figure, and what the joint method was to reach on the fixed files."""
+
+    what: str
+    unit: str
+    value: float
+    limit: float
 
 
 def figure_text(value: float, unit: str) -> str:
@@ -246,29 +253,30 @@ TRIALS, WORLDS, GROOVES, BOSSES = 10, 8, 3, 2
 QUICK_SETS = ("xy_paper", "tilt_nominal")
 
 
-@command("reproduce profiler", short_help="Repeat both papers on laser profilers.")
-def profiler(
-    call: Call,
-    data: Annotated[
-        Path | None, option("--data", "FOLDER", "The fixed files. Without them, worlds generated from the seed.")
-    ] = None,
-    quick: Annotated[bool, switch("--quick", "Two sets of edges and two or three worlds.")] = False,
-) -> Outcome:
-    """Repeat both papers on laser profilers: their tables with ours for comparison."""
-    folder = STUDY.folder(call)
-    figures = compute(data, call.seed, quick, call.progress)
-    return STUDY.found(figures | {"written_to": folder}, folder)
+@figure("profiler", "both papers on laser profilers: their tables, their methods and the joint method")
+def profiler(run: Run) -> None:
+    """Repeat both papers on worlds from the seed, or on the fixed files in the folder --data, where targets decide."""
+    targets, edge, sphere = compute(run.data, run.seed, not run.full, run.progress)
+    missed = [not t.value <= t.limit for t in targets]
+    rows = (
+        (t.what, figure_text(t.value, t.unit), f"≤ {t.limit:g}", "MISSED" if bad else "met")
+        for t, bad in zip(targets, missed, strict=True)
+    )
+    run.table("", ("figure", "reached", "target", ""), rows)
+    for title, header, lines in (*_edge_tables(edge), *_sphere_tables(sphere)):
+        run.table(title, header, lines)
+    if run.data is not None and any(missed):
+        raise Missed(f"{sum(missed)} targets of the fixed files are missed; see the table.")
 
 
-def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> dict[str, Any]:
+def compute(
+    data: Path | None, seed: int, quick: bool, progress: Progress
+) -> tuple[list[Target], list[EdgeRow], list[WorldResult]]:
     """Run it, on the fixed files in the folder ``data`` or on trials made from the seed.
 
     Raises:
         InputError: the fixed files are not in the folder named.
     """
-    start = time.monotonic()
-    if data is not None and not data.is_dir():
-        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz and sphere.npz.")
     whole = None if quick else data
     if whole is not None:
         require_files(whole)
@@ -299,31 +307,10 @@ def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> di
     if whole is not None:
         targets += published_lines(results)
         targets += fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share))
-    return {
-        "met": all_met(targets),
-        "data": "fixed files" if data else f"seed {seed}",
-        "targets": [
-            {"what": t.what, "unit": t.unit, "reached": t.value, "target": t.limit, "verdict": t.verdict}
-            for t in targets
-        ],
-        "edge": rows,
-        "sphere": results,
-        "wall_seconds": time.monotonic() - start,
-    }
+    return targets, rows, results
 
 
-def _lines(figures: Figures) -> Iterable[Row]:
-    for t in figures["targets"]:
-        yield t["what"], figure_text(t["reached"], t["unit"]), f"≤ {t['target']:g}", t["verdict"]
-
-
-def _missed(figures: Figures) -> list[Target]:
-    """The targets were set for the fixed files: other worlds may be harder, and decide nothing."""
-    missed = sum(t["verdict"] != "met" for t in figures["targets"])
-    return [Target("missed targets", "", missed, 0.0, decides=figures["data"] == "fixed files")]
-
-
-def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
+def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[tuple[str, Row, list[Row]]]:
     """Make tables 1 to 3 of the edge paper, over 10 to 25 rotations.
 
     As printed for its three objects and of every set and method; and the calibration's own error, which those
@@ -361,7 +348,7 @@ def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
         yield f"Edge paper, Table {title}", ("set", "method", *counts), lines
 
 
-def _sphere_tables(results: Iterable[WorldResult]) -> Iterable[Table]:
+def _sphere_tables(results: Iterable[WorldResult]) -> Iterable[tuple[str, Row, list[Row]]]:
     """Tables 1 to 3 of the sphere paper."""
     points: list[Row] = []
     seam: list[Row] = []
@@ -388,14 +375,3 @@ def _sphere_tables(results: Iterable[WorldResult]) -> Iterable[Table]:
 
 def _printed(values: Iterable[float] | None, count: int = 3) -> list[str]:
     return ["–"] * count if values is None else [fixed(v, 3) for v in values]
-
-
-STUDY = Study(
-    name="profiler",
-    what="Both papers on laser profilers: their methods and the joint method, against targets set on the fixed files.",
-    header=("figure", "reached", "target", ""),
-    rows=_lines,
-    targets=_missed,
-    others=lambda figures: [*_edge_tables(figures["edge"]), *_sphere_tables(figures["sphere"])],
-    group="reproduce",
-)

@@ -1,16 +1,15 @@
 """Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
-import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from tests.figures.harness import Cases, Figures, Results, Row, Study, whole
+from tests.figures.harness import Run, figure
 from tests.figures.profiler.papers import (
     SPHERE_METHODS,
     TARGETS,
@@ -33,15 +32,13 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
-from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.report.pictures import OURS, plain, svg
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
 
 
-def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, object]:
+def one_seed(seed: int | None = None, data: str | None = None) -> dict[str, Any]:
     """Return every figure of a seed, or of the fixed files in the folder ``data``, with its Cramer-Rao bound.
 
     Returns:
@@ -71,69 +68,19 @@ def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, o
     return {"seed": seed, "nees": nees, "values": values | sphere_figures(results), "bounds": bounds | predicted}
 
 
-def cases(first: int, count: int, data: Path | None) -> Cases:
-    """``count`` seeds, and the fixed files where their folder is given."""
-    seeds: dict[str, dict[str, Any]] = {f"seed {k}": {"seed": k} for k in range(first, first + count)}
-    return seeds if data is None else {"fixed files": {"data": str(data)}} | seeds
-
-
-def _figures(results: Results) -> Figures:
-    seeds = [r for r in whole(results).values() if r["seed"] is not None]
-    fixed = results.get("fixed files", {"values": {}, "bounds": {}})
+def target_lines(seeds: list[dict[str, Any]], fixed: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return values and bounds over the seeds for each target, beside the fixed files' where they are known."""
     lines = []
     for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]:
         values, bounds = (np.array([r[key][what] for r in seeds], dtype=float) for key in ("values", "bounds"))
-        lines.append(
-            {
-                "what": what,
-                "unit": unit,
-                "target": target,
-                "median": float(np.median(values)),
-                "least": float(values.min()),
-                "largest": float(values.max()),
-                "met": int((values <= target).sum()),
-                "bound": float(np.median(bounds)),
-                "over_bound": float(np.sqrt(np.mean(values**2) / np.mean(bounds**2))),
-                "fixed_files": fixed["values"].get(what),
-                "fixed_files_bound": fixed["bounds"].get(what),
-                "values": values,
-                "bounds": bounds,
-            }
-        )
-    nees = [v for r in seeds for v in r["nees"]]
-    return {
-        "seeds": [seeds[0]["seed"], seeds[-1]["seed"]],
-        "edge_nees": float(np.mean(nees)),
-        "edge_trials": len(nees),
-        "lines": lines,
-    }
+        over = float(np.sqrt(np.mean(values**2) / np.mean(bounds**2)))
+        line = {"what": what, "unit": unit, "target": target, "values": values, "bounds": bounds, "over_bound": over}
+        lines.append(line | {"fixed_files": fixed["values"].get(what) if fixed else None})
+    return lines
 
 
-def _rows(figures: Figures) -> Iterable[Row]:
-    for n in figures["lines"]:
-        fixed = "" if n["fixed_files"] is None else f"{n['fixed_files']:.3f}"
-        reached = f"{n['least']:.3f} to {n['largest']:.3f} {n['unit']}"
-        yield (
-            n["what"],
-            reached,
-            f"{n['over_bound']:.2f}",
-            f"{n['target']:g}",
-            f"{n['met']} of {len(n['values'])}",
-            fixed,
-        )
-    yield (
-        "edge, squared error in units of the bound",
-        f"{figures['edge_nees']:.2f}",
-        "",
-        "6 expected",
-        f"{figures['edge_trials']} trials",
-        "",
-    )
-
-
-def over_seeds(results: Results) -> bytes:
+def over_seeds(lines: list[dict[str, Any]]) -> bytes:
     """Return every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
-    lines = _figures(results)["lines"]
     picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
     axes = picture.add_subplot()
     for k, n in enumerate(lines):
@@ -154,36 +101,25 @@ def over_seeds(results: Results) -> bytes:
     return svg(picture)
 
 
-STUDY = Study(
-    name="profiler-seeds",
-    what="Every target of `./tools/run figures reproduce profiler` over many seeds, beside the Cramer-Rao bound.",
-    case=one_seed,
-    figures=_figures,
-    header=("figure", "reached", "of the bound", "target", "met", "fixed files"),
-    rows=_rows,
-    plots={"seeds.svg": over_seeds},
-    group="reproduce",
-)
-
-
-@command(
-    "reproduce profiler-seeds",
-    short_help="Run every target of 'reproduce profiler' on many seeds.",
-    options=FARM,
-    hidden=True,
-)
-def profiler_seeds(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds.", min=2)] = 12,
-    data: Annotated[Path | None, option("--data", "FOLDER", "The fixed files, shown together with the seeds.")] = None,
-) -> Outcome:
-    """Run every target of 'reproduce profiler' over many seeds and compare with the Cramer-Rao bound. 20 s per seed."""
-    if data is not None and not data.is_dir():
-        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz and sphere.npz.")
-    start = time.monotonic()
-    found = STUDY.outcome(call, cases(call.seed, seeds, data))
-    more = {"wall_seconds": time.monotonic() - start, "written_to": call.written}
-    return replace(found, summary={**found.summary, **more})
+@figure("profiler-seeds", "every target of the figure `profiler` over seeds, beside the Cramer-Rao bound")
+def profiler_seeds(run: Run) -> None:
+    """Compare with the bound; --data adds the fixed files. 20 s a seed."""
+    seeds = []
+    for seed in run.seeds(2, 12):
+        run.progress(f"seed {seed}", 0.0)
+        seeds.append(one_seed(seed))
+    lines = target_lines(seeds, {} if run.data is None else one_seed(data=str(run.data)))
+    run.write("seeds.svg", over_seeds(lines))
+    rows = []
+    for n in lines:
+        reached = f"{n['values'].min():.3f} to {n['values'].max():.3f} {n['unit']}"
+        met = f"{(n['values'] <= n['target']).sum()} of {len(seeds)}"
+        files = "" if n["fixed_files"] is None else f"{n['fixed_files']:.3f}"
+        rows.append((n["what"], reached, f"{n['over_bound']:.2f}", f"{n['target']:g}", met, files))
+    nees = [v for r in seeds for v in r["nees"]]
+    what = "edge, squared error in units of the bound"
+    rows.append((what, f"{np.mean(nees):.2f}", "", "6 expected", f"{len(nees)} trials", ""))
+    run.table("", ("figure", "reached", "of the bound", "target", "met", "fixed files"), rows)
 
 
 def _sphere(worlds: Iterable[WorldData], seed: int) -> tuple[list[WorldResult], dict[str, float]]:

@@ -1,15 +1,10 @@
-"""Timing of the robot link: a 125 Hz command stream through the Diagram, and whole jobs on an emulated controller."""
+"""Timing of the robot link: a 125 Hz command stream through the Diagram."""
 
 from __future__ import annotations
 
-import dataclasses as dc
-import subprocess
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,29 +13,22 @@ from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import Adder, Sine, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from tests.figures.harness import Missed, Run, figure
 from tests.worlds.robot.fault_run import LOADED
-from tests.worlds.robot.timing import STEP_JOINT, STEP_RAD_S, HostLateness, Tap, watched_host
+from tests.worlds.robot.timing import STEP_JOINT, STEP_RAD_S, Tap
 from weldcal.models.arms.kinematics import ArmModel, load_arm
-from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
-from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness, WallClock
-from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.commands.run import robot_at
-from weldcal.tools.commands.weld import run_scenario
+from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.render import csv_text, write_atomic, write_json
-from weldcal.tools.report.run import RunOptions
 
 RATE_HZ = 125.0
 READ_S = 0.002
 MISSED_S = 0.020  # a command that comes so much later than its time is named
-TRANSPORT = option("--transport", "NAME", "native or ur_rtde.")
 PERCENTILES = (50, 90, 99)
 MOST_STOPS = 20
 
@@ -51,7 +39,7 @@ STEP_S = 0.5
 STEPS = (1.0, 0.0, -1.0, 0.0)
 
 
-class Missed(NamedTuple):
+class Late(NamedTuple):
     """A command that came more than MISSED_S after its time: when in the run (s), and by how much it came late (s)."""
 
     at_s: float
@@ -74,11 +62,11 @@ class StreamReport:
     stops: tuple[tuple[float, str], ...] = ()
 
     @property
-    def missed(self) -> list[Missed]:
+    def missed(self) -> list[Late]:
         """Every one of them."""
         times = np.array(self.tap.command_times)
         late = self.tap.periods - 1.0 / RATE_HZ
-        return [Missed(float(times[k + 1] - times[0]), float(late[k])) for k in np.flatnonzero(late > MISSED_S)]
+        return [Late(float(times[k + 1] - times[0]), float(late[k])) for k in np.flatnonzero(late > MISSED_S)]
 
     def summary(self) -> dict[str, object]:
         """Return the JSON object: milliseconds unless the key says otherwise.
@@ -145,14 +133,7 @@ def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_
 
 
 def run_robot_benchmark(
-    out: Path,
-    *,
-    address: str | None = None,
-    minutes: float = 10.0,
-    seed: int = 0,
-    lockstep: float = 0.0,
-    transport: str = NATIVE,
-    progress: Progress = no_progress,
+    out: Path, *, minutes: float = 10.0, seed: int = 0, lockstep: float = 0.0, progress: Progress = no_progress
 ) -> StreamReport:
     """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
 
@@ -160,9 +141,9 @@ def run_robot_benchmark(
     stream goes on over a new link.
     """
     left, stops, tap = 60.0 * minutes, list[tuple[float, str]](), None
-    with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
+    with emulator_process(seed=seed, lockstep=lockstep) as emulator:
         while True:
-            prepared = PrepareRobot(UrRtde(host=emulator.host, transport=transport), load_arm())
+            prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
             link = cast(UrLink, prepared.handle)
             if tap is None:
                 tap = Tap(link=link)
@@ -191,13 +172,6 @@ def _steps(seconds: float) -> PiecewisePolynomial:
     return PiecewisePolynomial.ZeroOrderHold(STEP_S * np.arange(n), samples)
 
 
-def one_transport(name: str) -> str:
-    """Return the option's value. Raises InputError for another."""
-    if name not in (NATIVE, UR_RTDE):
-        raise InputError(f"--transport must be {NATIVE} or {UR_RTDE}, not '{name}'.")
-    return name
-
-
 def _spread(values_s: NDArray[np.float64]) -> dict[str, float]:
     if not values_s.size:
         return {}
@@ -205,189 +179,14 @@ def _spread(values_s: NDArray[np.float64]) -> dict[str, float]:
     return found | {"max": 1e3 * float(values_s.max())}
 
 
-@command(
-    "benchmark robot-stream",
-    short_help="Measure the periods of commands streamed at 125 Hz.",
-    hidden=True,
-    options=("address",),
-)
-def stream(
-    call: Call,
-    minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0,
-    transport: Annotated[str, TRANSPORT] = NATIVE,
-) -> Mapping[str, object]:
-    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or
-    more."""
-    found = run_robot_benchmark(
-        call.folder("benchmark", "robot"),
-        address=call.given["address"],
-        minutes=minutes,
-        seed=call.seed,
-        transport=one_transport(transport),
-        progress=call.progress,
-    )
-    return found.summary()
-
-
-BUSY = "while True: pass"
-
-
-@contextmanager
-def busy_programs(count: int) -> Iterator[None]:
-    """Programs of ordinary priority that each want a whole core, for the duration of the block."""
-    programs = [subprocess.Popen([sys.executable, "-I", "-S", "-c", BUSY]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for program in programs:
-            program.kill()
-            program.wait()
-
-
-@dataclass(frozen=True, kw_only=True)
-class JobTiming:
-    """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and the torch's error."""
-
-    seed: int
-    state: str
-    reason: str
-    lateness: Lateness = field(default_factory=Lateness)
-    slowest_percent: float = 0.0
-    slowed_s: float = 0.0
-    torch_mean_mm: float | None = None
-
-    @property
-    def line(self) -> str:
-        """One row of the table."""
-        late = self.lateness
-        torch = self.torch_mean_mm
-        return (
-            f"{self.state}{': ' + self.reason if self.reason else ''}; {late.on_time_percent:.2f} % of"
-            f" {sum(late.counts)} under {ON_TIME_MS:.0f} ms, latest {late.worst_ms:.1f} ms; slowest"
-            f" {self.slowest_percent:.0f} %, {self.slowed_s:.2f} s longer"
-            + ("" if torch is None else f"; torch {torch:.3f} mm mean")
-        )
-
-
-@dataclass(frozen=True)
-class JobsReport:
-    """All jobs of a study."""
-
-    jobs: list[JobTiming]
-    load: int
-    host: HostLateness
-
-    @property
-    def lateness(self) -> Lateness:
-        """That of all jobs together."""
-        counts = np.sum([job.lateness.counts for job in self.jobs], axis=0)
-        return Lateness([int(count) for count in counts], max(job.lateness.worst_ms for job in self.jobs))
-
-    def summary(self) -> dict[str, object]:
-        """Return the JSON object; `over_8_ms` counts velocities, `limits_ms` bound the bins."""
-        late = self.lateness
-        return {
-            "state": "done",
-            "jobs": len(self.jobs),
-            "jobs_done": sum(job.state == "done" for job in self.jobs),
-            "busy_programs": self.load,
-            "under_4_ms_percent": late.on_time_percent,
-            "over_8_ms": late.over(8.0),
-            "over_8_ms_by_host": self.host.caused([job.lateness for job in self.jobs]),
-            "worst_ms": late.worst_ms,
-            "limits_ms": list(LIMITS_MS),
-            "velocities": late.counts,
-            "host": self.host.summary(),
-            "slowest_percent": min(job.slowest_percent for job in self.jobs),
-            "held": [{"id": f"seed {job.seed}", "reason": job.reason} for job in self.jobs if job.state != "done"],
-        }
-
-
-def run_jobs(
-    scenario: str,
-    out: Path,
-    runs: int,
-    *,
-    seed: int = 0,
-    load: int = 0,
-    seam_mm: float | None = None,
-    transport: str = NATIVE,
-    progress: Progress = no_progress,
-) -> JobsReport:
-    """Run the scenario's job with consecutive seeds, each on a controller of its own at its own pace, without lockstep.
-
-    Args:
-        scenario: name or path.
-        out: gets jobs.json, and a folder with the report of each job.
-        runs: how many jobs.
-        seed: of the first.
-        load: busy programs beside.
-        transport: native or ur_rtde.
-        seam_mm: length of the seam to weld; the scenario's where None.
-        progress: gets the job that runs.
-    """
-    found = []
-    overrides = "" if seam_mm is None else f"welding: {{seam_length_mm: {seam_mm}}}"
-    with watched_host() as host, busy_programs(load):
-        for k in range(runs):
-            progress(f"job {k + 1} of {runs}", k / runs)
-            described = load_scenario(scenario, overrides)
-            described.robot = dc.replace(robot_at("", described), transport=transport)
-            found.append(_job(described, out / f"seed{seed + k}", scenario, seed + k))
-    report = JobsReport(found, load, host)
-    write_json(out / "jobs.json", report.summary() | {"rows": {f"seed {job.seed}": job.line for job in found}})
-    return report
-
-
-def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
-    q_home = np.deg2rad(described.home_deg)
-    kinematics = None if described.kinematics is None else Path(described.kinematics)
-    with emulator_process(q=q_home.tolist(), kinematics=kinematics) as controller:
-        options = RunOptions(scenario=name, out=out, seed=seed, robot=controller.host, pace=1.0, recording=False)
-        try:
-            result = run_scenario(described, options)
-        except WeldcalError as error:  # the start was refused
-            return JobTiming(seed=seed, state="refused", reason=str(error))
-    result.run.raise_if_interrupted()
-    summary, clock = result.summary(), result.run.clock
-    assert clock is not None
-    return JobTiming(
-        seed=seed,
-        state=str(summary["state"]),
-        reason=str(summary.get("reason") or ""),
-        lateness=clock.lateness,
-        slowest_percent=100.0 * clock.slowest_rate,
-        slowed_s=clock.slowed_s,
-        torch_mean_mm=cast(float | None, summary.get("torch_mean_mm")),
-    )
-
-
-@command("benchmark robot-jobs", short_help="Measure how late velocities are in whole jobs.", hidden=True)
-def jobs(
-    call: Call,
-    scenario: Annotated[
-        str, option("--scenario", "NAME", "Name of a scenario, or path of a scenario YAML file.")
-    ] = "s_groove",
-    runs: Annotated[int, option("--runs", "N", "Number of jobs.", min=1)] = 10,
-    load: Annotated[int, option("--load", "N", "Busy programs beside the jobs.", min=0)] = 0,
-    seam_mm: Annotated[
-        float | None, option("--seam-mm", "MM", "Length of the seam.", min=10.0, show_default="the scenario's")
-    ] = None,
-    transport: Annotated[str, TRANSPORT] = NATIVE,
-) -> Outcome:
-    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy
-    programs."""
-    folder = call.folder("benchmark", f"robot-jobs-{scenario}")
-    result = run_jobs(
-        scenario,
-        folder,
-        runs,
-        seed=call.seed,
-        load=load,
-        seam_mm=seam_mm,
-        transport=one_transport(transport),
-        progress=call.progress,
-    )
-    rows = {f"seed {job.seed}": job.line for job in result.jobs} | {"this computer": result.host.line}
-    rows["all"] = result.host.judged([job.lateness for job in result.jobs])
-    return Outcome(result.summary(), rows=rows)
+@figure("robot-stream", "a 125 Hz command stream through the Diagram to an emulated controller: periods, latencies")
+def robot_stream(run: Run) -> None:
+    """Stream for ten minutes (12 s in the quick form); deadlines missed by 20 ms or more are named."""
+    report = run_robot_benchmark(run.out, minutes=run.size(0.2, 10.0), seed=run.seed, progress=run.progress)
+    found = report.summary()
+    spreads = {name: value for name, value in found.items() if isinstance(value, dict)}
+    rows = ((name, *(f"{v:.2f}" for v in value.values())) for name, value in spreads.items())
+    run.table("", ("figure", *(f"p{p}" for p in PERCENTILES), "max"), rows)
+    run.table("", ("figure", "found"), ((k, str(v)) for k, v in found.items() if k not in spreads))
+    if report.fault:
+        raise Missed(report.fault)

@@ -6,21 +6,19 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from tests.figures.harness import Cases, Figures, Results, Row, Study, markdown_table
+from tests.figures.harness import Missed, Run, figure
 from tests.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
-from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
+from weldcal.models.errors import WeldcalError
+from weldcal.tools.console import Progress
 from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
-from weldcal.tools.farm.run import Farm
-from weldcal.tools.report.render import mappings_csv, write_atomic, write_json
+from weldcal.tools.report.render import fixed, mappings_csv, write_atomic
 
 SEAM_MM = 20.0
 CALIBRATES = 0.25  # share of the cycles
@@ -35,13 +33,8 @@ IN_USE = "in_use"
 BLOCK_BYTES = 512  # at most, of what Python gives out itself: larger things come from the C library
 
 
-def run_soak(
-    folder: Path, minutes: float, seed: int, progress: Progress = no_progress
-) -> tuple[dict[str, object], str]:
-    """Cycles until the time is over: the JSON object, and the printed table.
-
-    Writes cycles.csv after each cycle, and soak.json.
-    """
+def run_soak(folder: Path, minutes: float, seed: int, progress: Progress) -> dict[str, Any]:
+    """Cycles until the time is over; writes cycles.csv after each cycle."""
     rng = np.random.default_rng([seed, 20])
     rows: list[dict[str, object]] = []
     host = f"127.36.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
@@ -67,9 +60,7 @@ def run_soak(
             if not _alive(world.process.pid):
                 break
         world_lives = _alive(world.process.pid)
-    found = _summary(rows, time.monotonic() - begun, world_lives=world_lives)
-    write_json(folder / "soak.json", found | {"rows": rows})
-    return found, _table(found)
+    return _summary(rows, time.monotonic() - begun, world_lives=world_lives)
 
 
 def _drawn(rng: np.random.Generator) -> tuple[Happening | None, bool]:
@@ -176,7 +167,7 @@ def grows(memory: Mapping[str, Mapping[str, object]]) -> list[str]:
     return [name for name in judged if memory[name]["flat"] is False]
 
 
-def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool) -> dict[str, object]:
+def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool) -> dict[str, Any]:
     hours = np.array([float(str(row["at_s"])) for row in rows]) / 3600.0
     memory = {}
     for name in (*PROCESSES, IN_USE):
@@ -212,125 +203,55 @@ def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool
     }  # fmt: skip
 
 
-def _table(found: Mapping[str, object]) -> str:
+@figure("soak", "calibrations and welds by wire in one process, with random faults, for 3 minutes (60 in full)")
+def soak(run: Run) -> None:
+    """Count faults by name, motion and arc without a command and stuck processes, and measure the memory."""
+    found = run_soak(run.out, run.size(3.0, 60.0), run.seed, run.progress)
     rows = [
         (key.replace("_", " "), f"{value:.1f}" if isinstance(value, float) else str(value))
         for key, value in found.items()
         if not isinstance(value, dict | list)
     ]
-    for name, m in found["memory"].items():  # type: ignore[attr-defined]
-        slope = (
-            "too short a run for a slope"
-            if m["mb_per_h"] is None
-            else f"{m['mb_per_h']:+.1f} MB/h ({m['low']:+.1f} to {m['high']:+.1f})"
-        )
+    for name, m in found["memory"].items():
+        short = m["mb_per_h"] is None
+        slope = "too short a run" if short else f"{m['mb_per_h']:+.1f} MB/h ({m['low']:+.1f} to {m['high']:+.1f})"
         rows.append((f"memory: {name}", f"{m['first_mb']:.0f} to {m['last_mb']:.0f} MB, {slope}"))
-    rows += [("wrong", text) for text in found["wrong"]]  # type: ignore[attr-defined]
-    return markdown_table(("what", "value"), rows)
-
-
-@command("benchmark soak", short_help="Calibrate and weld by wire for an hour with faults.", hidden=True)
-def soak(
-    call: Call, minutes: Annotated[float, option("--minutes", "M", "How long new cycles begin.", min=0.1)] = 60.0
-) -> Outcome:
-    """Calibrate and weld by wire again and again with random faults: memory, stuck processes, faults by name, motion
-    and arc."""
-    summary, table = run_soak(call.folder("benchmark", "soak"), minutes, call.seed, call.progress)
-    return Outcome(summary, text=table)
+    run.table("", ("what", "value"), [*rows, *(("wrong", text) for text in found["wrong"])])
+    if found["state"] != "done":
+        raise Missed(found["reason"])
 
 
 TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
 
 
-def one_world(device: str, phase: str, seed: int, folder: str) -> Mapping[str, object]:
-    """Return every fault of a device in a phase, one job each, in one world."""
-    host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
-    with wired_world(Path(folder) / "world", host, seed, SEAM_MM, bridged=True) as world:
-        return {"rows": [_row(world, Path(folder), seed, Happening(device, fault, phase)) for fault in FAULTS]}
+@figure("wired-faults", "each device by wire killed, frozen, delayed by 2 s or sending garbage, in each phase of a job")
+def wired_faults(run: Run) -> None:
+    """Disturb each device in each phase (in the quick form the scanner in the weld), one job each."""
+    places = [(d, p) for d in DEVICES for p in PHASES] if run.full else [("scanner", "weld")]
+    rows: list[dict[str, Any]] = []
+    for device, phase in places:
+        run.progress(f"{device}, {phase}", len(rows) / len(places) / len(FAULTS))
+        folder = run.out / f"{device}_{phase}".replace(" ", "_")
+        host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+        with wired_world(folder / "world", host, run.seed, SEAM_MM, bridged=True) as world:
+            rows += [_row(world, folder, run.seed, Happening(device, fault, phase)) for fault in FAULTS]
+    lines = (
+        (
+            *(str(r[key]) for key in ("device", "fault", "phase", "state")),
+            *(fixed(r.get(key)) for key in TIMES),
+            *("; ".join(r["problems"]) or "as required", str(r["reason"])),
+        )
+        for r in rows
+    )
+    times = ("torch off s", "arm at rest s", "named s")
+    run.table("", ("device", "fault", "phase", "job", *times, "verdict", "reason"), lines)
+    if wrong := [r for r in rows if r["problems"]]:
+        raise Missed(f"{len(wrong)} of {len(rows)} faults were not held by their name; see the table.")
 
 
-def _row(world: WiredWorld, folder: Path, seed: int, happening: Happening) -> dict[str, object]:
+def _row(world: WiredWorld, folder: Path, seed: int, happening: Happening) -> dict[str, Any]:
     calibrates = happening.phase == "calibrate"
     try:
         return run_job(world, folder / happening.fault, seed, calibrates=calibrates, happening=happening)
     except WeldcalError as problem:  # the job did not begin: what the fault before it has left
-        said = str(problem)
-        return dc.asdict(happening) | {"state": "failed", "reason": said, "problems": [said]}
-
-
-def fault_cases(folder: Path, seed: int, devices: Sequence[str] = (), phases: Sequence[str] = ()) -> Cases:
-    """One world for each device and phase, or for those that are chosen.
-
-    Raises:
-        InputError: there is no such device or phase.
-    """
-    for given, known in ((devices, DEVICES), (phases, tuple(PHASES))):
-        if unknown := [name for name in given if name not in known]:
-            raise InputError(f"There is no '{unknown[0]}' here: choose of {', '.join(known)}.")
-    return {
-        f"{device}, {phase}": {
-            "device": device,
-            "phase": phase,
-            "seed": seed,
-            "folder": str(folder.absolute() / f"{device}_{phase}".replace(" ", "_")),
-        }
-        for device in devices or DEVICES
-        for phase in phases or PHASES
-    }
-
-
-def _faults(found: Results) -> Figures:
-    rows = [row for result in found.values() for row in result.get("rows", ())]
-    wrong = [f"{r['device']} {r['fault']} in {r['phase']}: {'; '.join(r['problems'])}" for r in rows if r["problems"]]
-    wrong += [f"{name}: {result['reason']}" for name, result in found.items() if "rows" not in result]
-    return {
-        "state": "failed" if wrong else "done",
-        "faults": len(rows),
-        "held_by_name": sum(r["state"] == "held" for r in rows),
-        "done_while_silent": sum(r["state"] == "done" for r in rows),
-        "wrong": wrong,
-        "rows": rows,
-        **({"reason": wrong[0]} if wrong else {}),
-    }
-
-
-def _fault_rows(figures: Figures) -> Iterable[Row]:
-    for r in figures["rows"]:
-        times = (_seconds(r.get(name)) for name in TIMES)
-        verdict = "; ".join(r["problems"]) or "as required"
-        yield str(r["device"]), str(r["fault"]), str(r["phase"]), str(r["state"]), *times, verdict, str(r["reason"])
-
-
-def _seconds(value: object) -> str:
-    return "" if value in (None, "") else f"{float(str(value)):.2f}"
-
-
-WIRED_FAULTS = Study(
-    name="wired-faults",
-    what="Every device by wire killed, frozen, delayed by 2 s and sending garbage, in every phase of the job.",
-    case=one_world,
-    figures=_faults,
-    header=("device", "fault", "phase", "job", "torch off s", "arm at rest s", "named s", "verdict", "reason"),
-    rows=_fault_rows,
-)
-
-
-@command(
-    "benchmark wired-faults",
-    short_help="Disturb each device by wire in each phase of the job.",
-    hidden=True,
-    options=FARM,
-)
-def wired_faults(
-    call: Call,
-    devices: Annotated[list[str] | None, option("--device", "NAME", "Only this device; repeat for more.")] = None,
-    phases: Annotated[list[str] | None, option("--phase", "NAME", "Only this phase; repeat for more.")] = None,
-) -> Outcome:
-    """Kill, freeze and delay each device by wire, and let it send garbage, in each phase: the arm must stop, and the
-    job say why."""
-    folder = call.folder("benchmark", "wired-faults")
-    found = WIRED_FAULTS.run(
-        Farm.of(folder, call.given, call.progress), fault_cases(folder, call.seed, devices or (), phases or ())
-    )
-    write_atomic(folder / "faults.csv", mappings_csv(found.figures["rows"]))
-    return Outcome(found.figures, text=found.markdown())
+        return dc.asdict(happening) | {"state": "failed", "reason": str(problem), "problems": [str(problem)]}

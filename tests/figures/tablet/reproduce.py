@@ -1,14 +1,13 @@
 """Reproduces the tablet paper: its tables, stages, signs and models, with targets; and times each calibration."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.figures.harness import Figures, Row, Study, Table, Target, all_met
+from tests.figures.harness import Row, Run, figure
 from tests.worlds.tablet import (
     STAGE_1,
     TABLE_NUMBER,
@@ -18,15 +17,7 @@ from tests.worlds.tablet import (
     published_touches,
     simulate_trial,
 )
-from weldcal.calibration.tablet.planar_fit import (
-    PlanarConfig,
-    fit_linear,
-    fit_planar,
-    fit_plane_motion,
-    hand_over,
-    solve_closed_form,
-    touched_rays,
-)
+from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, fit_plane_motion, hand_over
 from weldcal.calibration.tablet.published import (
     PUBLISHED_EVALUATIONS,
     PUBLISHED_POPULATION,
@@ -44,10 +35,8 @@ from weldcal.calibration.tablet.published import (
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
-from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.console import Progress
 from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
-from weldcal.tools.report.render import fixed, write_json
+from weldcal.tools.report.render import fixed
 
 MODELS: tuple[Model, ...] = ("htm", "dh")
 
@@ -261,53 +250,7 @@ def _held_out_row(name: str, trials: list[TabletTrial], asked: Callable[[TabletT
     return HeldOutRow(name, len(trials), 1e3 * float(np.mean(errors)))
 
 
-@command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
-def benchmark_tablet(call: Call) -> Mapping[str, object]:
-    """Time each tablet calibration and compare it with the published search."""
-    folder = call.folder("benchmark", "tablet")
-    found = times(call.progress)
-    write_json(folder / "benchmark.json", found)
-    return found
-
-
-def times(progress: Progress) -> dict[str, object]:
-    """Time every calibration on the published data."""
-    touches = published_touches()
-    progress("closed form", 0.0)
-    rays, hand, theta = touched_rays(touches).T.copy(), touches.hand_m.T.copy(), touches.theta_rad
-    closed = median_seconds(lambda: solve_closed_form(rays, hand, theta), 5000)
-    progress("PnP", 0.3)
-    config = PlanarConfig(free_scale=True)
-    planar = median_seconds(lambda: fit_planar(touches, config, leave_one_out=False), 100)
-    progress("two stages", 0.5)
-    stage1 = tablet_stage1(touches)
-    two_stages = median_seconds(lambda: tablet_stage2(touches, tablet_stage1(touches).parameters), 3)
-    alone, crowd = evaluation_seconds(touches)
-    published = PUBLISHED_EVALUATIONS * alone
-    return {
-        "state": "done",
-        "closed_form_us": 1e6 * closed,
-        "pnp_us": 1e6 * planar,
-        "two_stages_s": two_stages,
-        "stage_1_evaluations": stage1.evaluations,
-        "evaluation_us": 1e6 * alone,
-        "evaluation_in_crowd_us": 1e6 * crowd,
-        "published_search_extrapolated_s": published,
-        "published_search_in_crowds_extrapolated_s": PUBLISHED_EVALUATIONS * crowd,
-        "closed_form_times_faster": published / closed,
-        "two_stages_times_faster": 2.0 * published / two_stages,
-    }
-
-
 PUBLISHED_TRIALS = 20
-# What the reproduction must reach: mm, seconds
-FITNESS_TARGETS = {("htm", 1): 1.6739, ("htm", 2): 0.9989, ("dh", 1): 7.103, ("dh", 2): 4.272}
-FITNESS_TOLERANCE = 0.0015
-FOUR_FITS_S = 1.0
-LEFT_OUT_MM = 0.46
-HELD_OUT_MM = 0.222
-CLOSED_FORM, BEST = "closed form", "PnP, rigid, pen: hands rounded to 1 mm"
-_LIMIT_WORDS = {"≤": "at most ", "<": "under ", "≥": "at least ", "±": ""}
 _LARGER = 20.0
 SIGN_WORDS = {Sign.PRINTED: "as printed (−)", Sign.NONE: "left out", Sign.CORRECTED: "reversed (+)"}
 _TITLES = {
@@ -318,131 +261,37 @@ _TITLES = {
 }
 
 
-@command("reproduce tablet", short_help="Repeat the tablet paper: Tables 7 to 12.")
-def tablet(
-    call: Call,
-    evolution_seeds: Annotated[
-        int, option("--evolution-seeds", "N", "Seeds of differential evolution per table; each takes seconds.", min=0)
-    ] = 1,
-    trials: Annotated[int, option("--trials", "N", "Simulated trials for the error on unseen points.", min=1)] = 60,
-) -> Outcome:
-    """Repeat the tablet paper: Tables 7 to 12, the sign of Eq. 20, and models with smaller prediction errors."""
-    folder = call.folder("reproduce", "tablet")
-    return (
-        run_study(call.seed, evolution_seeds, trials, call.progress, {"written_to": folder})
-        .measured({}, folder)
-        .outcome()
+@figure("tablet", "the tablet paper repeated: Tables 7 to 12, the sign of Eq. 20, models with smaller errors")
+def tablet(run: Run) -> None:
+    """Repeat the tablet paper; differential evolution runs in the full form only."""
+    touches, (seeds, trials) = published_touches(), run.size((0, 2), (1, 60))
+    rows: Iterable[Row]
+    stages, cost = reproduce_stages(touches, tuple(range(run.seed + 1, run.seed + 1 + seeds)))
+    run.progress("one landmark left out", 0.5)
+    rows = (
+        (m.name, str(m.unknowns), fixed(m.in_sample_mm, 3), fixed(m.left_out_mm, 3), fixed(m.worst_mm))
+        for m in compare_models(touches)
     )
-
-
-def run_study(seed: int, evolution_seeds: int, trials: int, progress: Progress, more: Figures) -> Study:
-    """Return the study with all that it computed; its JSON object ends with ``more``."""
-    start = time.monotonic()
-    touches = published_touches()
-    progress("tables 7, 8, 10, 11", 0.0)
-    stages, cost = reproduce_stages(touches, tuple(range(seed + 1, seed + 1 + evolution_seeds)))
-    progress("signs and chains", 0.5)
-    dh, signs = dh_by_eq_20(touches), compare_signs(touches)
-    progress("one landmark left out", 0.55)
-    models = compare_models(touches)
-    progress("simulated trials", 0.7)
-    unseen = held_out(seed, trials, min(trials, PUBLISHED_TRIALS))
-    left_out = next(m.left_out_mm for m in models if m.name == CLOSED_FORM)
-    targets = (
-        *(
-            Target(
-                f"Table {TABLE_NUMBER[r.model, r.stage]}: F of stage {r.stage}, {r.model.upper()}, mm",
-                "",
-                r.ours.fitness.F,
-                FITNESS_TARGETS[r.model, r.stage],
-                "±",
-                FITNESS_TOLERANCE,
-            )
-            for r in stages
-        ),
-        Target("all four together, s", "", cost.four_fits, FOUR_FITS_S, "<", decides=False),
-        Target("leave one landmark out, published data, mm", "", left_out, LEFT_OUT_MM),
-        Target("unseen queries, simulated, mm", "", next(u.mean_mm for u in unseen if u.name == BEST), HELD_OUT_MM),
+    run.table("", ("published data", "unknowns", "in sample mm", "held out mm", "largest mm"), rows)
+    unseen = held_out(run.seed, trials, min(trials, PUBLISHED_TRIALS))
+    rows = ((u.name, str(u.trials), fixed(u.mean_mm, 3)) for u in unseen)
+    run.table("Unseen queries", ("simulated", "trials", "unseen mm"), rows)
+    rows = (
+        (SIGN_WORDS[s.sign], fixed(s.rigid_mm, 3), fixed(s.scaled_mm, 3), fixed(s.left_out_mm, 2))
+        for s in compare_signs(touches)
     )
-    named = {(r.model, r.stage): r.ours for r in stages}
-    figures: dict[str, Any] = {
-        "met": all_met(targets),
-        "F1": named["htm", 1].fitness.F,
-        "F2": named["htm", 2].fitness.F,
-        "parameters": dict(zip(STAGE_1["htm"].names, named["htm", 1].parameters, strict=True)),
-        "leave_one_out_mm": left_out,
-        "seconds": cost.four_fits,
-        "tables": {str(TABLE_NUMBER[r.model, r.stage]): _table(r) for r in stages},
-        "touching_error_printed_mm": TOUCHING_MM,
-        "targets": [{"what": t.what, "reached": t.value, "limit": limit_words(t), "met": t.met} for t in targets],
-        "cost": {
-            **asdict(cost),
-            "published_extrapolated": PUBLISHED_EVALUATIONS * cost.one_evaluation,
-            "published_in_crowds_extrapolated": PUBLISHED_EVALUATIONS * cost.crowd_evaluation,
-        },
-        "dh_by_eq_20": dh,
-        "signs": signs,
-        "models": models,
-        "unseen": unseen,
-        "wall_seconds": time.monotonic() - start,
-    }
-    return Study(
-        name="tablet",
-        what="The tablet paper repeated: its tables, the sign of Eq. 20, and models with smaller prediction errors.",
-        figures=lambda results: {**figures, **more},
-        header=("published data", "unknowns", "in sample mm", "held out mm", "largest mm"),
-        rows=lambda found: [
-            (m.name, str(m.unknowns), fixed(m.in_sample_mm, 3), fixed(m.left_out_mm, 3), fixed(m.worst_mm))
-            for m in models
-        ],
-        numbers=4,
-        others=lambda found: _tables(found, stages),
-        targets=lambda found: targets,
-        plots={"figures/residuals.svg": lambda results: sign_residuals(touches)},
-        group="reproduce",
-    )
-
-
-def _tables(figures: Figures, stages: Iterable[Reproduced]) -> Iterable[Table]:
-    unseen = [(u.name, str(u.trials), fixed(u.mean_mm, 3)) for u in figures["unseen"]]
-    yield "Unseen queries", ("simulated", "trials", "unseen mm"), unseen
-    yield (
-        "The sign of Eq. 20, without a camera: the tablet's points against the hand",
-        ("touching error", "rigid, mm per axis", "with scale, mm per axis", "held out mm"),
-        [
-            (SIGN_WORDS[s.sign], fixed(s.rigid_mm, 3), fixed(s.scaled_mm, 3), fixed(s.left_out_mm, 2))
-            for s in figures["signs"]
-        ],
-    )
+    title = "The sign of Eq. 20, without a camera: the tablet's points against the hand"
+    run.table(title, ("touching error", "rigid, mm per axis", "with scale, mm per axis", "held out mm"), rows)
     for r in sorted(stages, key=lambda r: TABLE_NUMBER[r.model, r.stage]):
         title = f"Table {TABLE_NUMBER[r.model, r.stage]}: {_TITLES[r.model, r.stage]}"
-        yield title, ("", "printed", "ours", "differential evolution"), table_rows(r)
-    dh = [(name, fixed(f.F, 4), fixed(f.f1, 4), fixed(f.f2, 4)) for name, f in figures["dh_by_eq_20"].items()]
-    yield "The error in Table 8", ("", "F, mm", "f1, mm", "f2, mm"), dh
-    touching = [(f"Table {n}", *(fixed(v) for v in values)) for n, values in TOUCHING_MM.items()]
-    yield "Touched again by the paper's robot, printed, mm", ("", "1", "2", "3", "4", "5"), touching
-    minutes = f"{figures['cost']['published_extrapolated'] / 60.0:.0f} min, extrapolated from one"
-    yield "Cost", ("", ""), [("the paper's 1e8 evaluations", minutes)]
-
-
-def limit_words(target: Target) -> str:
-    """Return the bound in words, such as "at most 0.46"."""
-    return _LIMIT_WORDS[target.bound] + target.wanted.removeprefix(target.bound).strip()
-
-
-def _table(r: Reproduced) -> dict[str, object]:
-    printed = printed_stage(r.model, r.stage)
-
-    def one(fit: StageResult) -> dict[str, object]:
-        parameters = dict(zip(printed.names, fit.parameters, strict=True))
-        return {**asdict(fit.fitness), "parameters": parameters, "evaluations": fit.evaluations}
-
-    return {
-        "printed": {"F": printed.fitness, "parameters": dict(zip(printed.names, printed.parameters, strict=True))},
-        "ours": {**one(r.ours), "seconds": r.seconds},
-        "differential_evolution": [one(e) for e in r.evolved],
-        "differential_evolution_seconds": r.evolved_seconds,
-    }
+        run.table(title, ("", "printed", "ours", "differential evolution"), table_rows(r))
+    rows = ((name, fixed(f.F, 4), fixed(f.f1, 4), fixed(f.f2, 4)) for name, f in dh_by_eq_20(touches).items())
+    run.table("The error in Table 8", ("", "F, mm", "f1, mm", "f2, mm"), rows)
+    touching = ((f"Table {n}", *(fixed(v) for v in values)) for n, values in TOUCHING_MM.items())
+    run.table("Touched again by the paper's robot, printed, mm", ("", "1", "2", "3", "4", "5"), touching)
+    minutes = PUBLISHED_EVALUATIONS * cost.one_evaluation / 60.0
+    run.say(f"The four fits take {cost.four_fits:.2f} s; the paper's 1e8 evaluations {minutes:.0f} min, extrapolated.")
+    run.write("residuals.svg", sign_residuals(touches))
 
 
 def sign_residuals(touches: TabletTouches) -> bytes:

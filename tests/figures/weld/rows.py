@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,18 +21,15 @@ class UnknownRow(InputError):
     """No row of the study has this name."""
 
 
-@dataclass(frozen=True)
-class MetricTarget:
+class MetricTarget(NamedTuple):
     """A bound on one figure of RunMetrics: `over` the seeds ("worst" or "mean") it is to be at most `limit`."""
 
     figure: str
     limit: float
     over: str = "worst"
-    unit: str = "mm"
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A line of the table: its welds and their targets; every weld has to be completed as well."""
 
     key: str
@@ -40,112 +38,82 @@ class Row:
     targets: tuple[MetricTarget, ...]
 
 
-_CHORDS = (0.040, 0.060, 0.080)
+def _bounds(text: str) -> tuple[MetricTarget, ...]:
+    """Read "mean_mm 0.1 mean, max_mm 0.3": figure, limit, and over what if not the worst."""
+    parts = (part.split() for part in text.split(","))
+    return tuple(MetricTarget(name, float(limit), *over) for name, limit, *over in parts)
+
+
+CHORDS = (0.040, 0.060, 0.080)
 _EASY = ("straight", "s_r60", "l_r20_convex", "l_r20_concave")
-_BOUNDED = (MetricTarget("omega_rad_s", 0.8, unit="rad/s"), MetricTarget("tip_speed_mm_s", 40.0, unit="mm/s"))
+_CORNERS = tuple(f"l_{r}_{side}" for r in ("r5", "r1") for side in ("convex", "concave"))
+_CURVED = tuple(f"{s}_on_{r}" for s in ("s_r60", "l_r20") for r in ("r150", "r300"))
 _GAP_10, _GAP_25 = ((0.145, 0.155),), ((0.1375, 0.1625),)
+_SLOW = ", omega_rad_s 0.8, tip_speed_mm_s 40"
 
-_WRONG = (MetricTarget("mean_mm", 0.10, "mean"), MetricTarget("max_mm", 0.30), MetricTarget("height_mm", 0.65))
 
-ROWS: tuple[Row, ...] = (
-    Row(
-        "imperfect",
-        "imperfect world: straight, S R60, L R20",
-        tuple(WeldCase(seam, "imperfect") for seam in _EASY),
-        (*_WRONG, MetricTarget("space_mean_mm", 0.30, "mean"), MetricTarget("space_mm", 0.70), *_BOUNDED),
-    ),
-    Row(
-        "imperfect_corners",
-        "imperfect world: R5 and R1 corners",
-        tuple(WeldCase(f"l_{r}_{side}", "imperfect") for r in ("r5", "r1") for side in ("convex", "concave")),
+def _of(seams: Iterable[str], budget: str = "nominal", **more: Any) -> tuple[WeldCase, ...]:
+    return tuple(WeldCase(seam, budget, **more) for seam in seams)
+
+
+ROWS: tuple[Row, ...] = tuple(
+    Row(key, label, cases, _bounds(text))
+    for key, label, cases, text in (
         (
-            MetricTarget("mean_mm", 0.12, "mean"),
-            MetricTarget("max_mm", 0.50),
-            MetricTarget("height_mm", 0.65),
-            *_BOUNDED,
+            "imperfect",
+            "imperfect world: straight, S R60, L R20",
+            _of(_EASY, "imperfect"),
+            f"mean_mm 0.10 mean, max_mm 0.30, height_mm 0.65, space_mean_mm 0.30 mean, space_mm 0.70{_SLOW}",
         ),
-    ),
-    Row(
-        "nominal",
-        "perfectly known world: straight, S R60, L R20; chord 40, 60, 80 mm; nominal",
-        tuple(WeldCase(seam, chord_m=d) for seam in _EASY for d in _CHORDS),
         (
-            MetricTarget("mean_mm", 0.04, "mean"),
-            MetricTarget("max_mm", 0.15),
-            MetricTarget("cv_percent", 1.0, unit="%"),
-            MetricTarget("time_ratio", 1.02, unit="L/V"),
-            *_BOUNDED,
+            "imperfect_corners",
+            "imperfect world: R5 and R1 corners",
+            _of(_CORNERS, "imperfect"),
+            f"mean_mm 0.12 mean, max_mm 0.50, height_mm 0.65{_SLOW}",
         ),
-    ),
-    Row(
-        "hard",
-        "perfectly known world, hard budget, chord 60 mm",
-        tuple(WeldCase(seam, "hard") for seam in _EASY),
-        (MetricTarget("mean_mm", 0.12, "mean"), MetricTarget("max_mm", 0.45), *_BOUNDED),
-    ),
-    Row(
-        "hard_corners",
-        "R5 and R1 corners, hard budget: completed",
-        tuple(WeldCase(f"l_{r}_{side}", "hard") for r in ("r5", "r1") for side in ("convex", "concave")),
-        (MetricTarget("mean_mm", 0.12, "mean"), *_BOUNDED),
-    ),
-    Row(
-        "r5",
-        "L R5, nominal",
-        (WeldCase("l_r5_convex"), WeldCase("l_r5_concave")),
-        (MetricTarget("max_mm", 0.35), *_BOUNDED),
-    ),
-    Row("r1_concave", "L R1 concave, nominal", (WeldCase("l_r1_concave"),), (MetricTarget("max_mm", 0.30), *_BOUNDED)),
-    Row("r1_convex", "L R1 convex, nominal", (WeldCase("l_r1_convex"),), (MetricTarget("max_mm", 0.50), *_BOUNDED)),
-    Row(
-        "end",
-        "end of the seam: straight, on an R60 arc",
-        (WeldCase("straight"), WeldCase("arc_r60_end")),
-        (MetricTarget("end_mm", 0.12), MetricTarget("end_step_mm_s", 0.5, unit="mm/s")),
-    ),
-    Row(
-        "gap_10",
-        "gap of 10 mm, straight and S",
-        tuple(WeldCase(s, gaps=_GAP_10) for s in _EASY[:2]),
-        (MetricTarget("gap_mm", 0.12),),
-    ),
-    Row(
-        "gap_25",
-        "gap of 25 mm, straight and S",
-        tuple(WeldCase(s, gaps=_GAP_25) for s in _EASY[:2]),
-        (MetricTarget("gap_mm", 0.60),),
-    ),
-    Row(
-        "speed_16",
-        "16 mm/s: S R60, L R20",
-        tuple(WeldCase(s, speed_m_s=0.016) for s in _EASY[1:]),
-        (MetricTarget("max_mm", 0.20), *_BOUNDED),
-    ),
-    Row(
-        "speed_24",
-        "24 mm/s: S R60, L R20",
-        tuple(WeldCase(s, speed_m_s=0.024) for s in _EASY[1:]),
-        (MetricTarget("max_mm", 0.35), *_BOUNDED),
-    ),
-    Row(
-        "space",
-        "on cylinders of R 150 and 300 mm, kinematic budget",
-        tuple(WeldCase(f"{s}_on_{r}", "kinematic") for s in ("s_r60", "l_r20") for r in ("r150", "r300")),
         (
-            MetricTarget("mean_mm", 0.03, "mean"),
-            MetricTarget("space_mm", 0.03),
-            MetricTarget("work_deg", 3.0, unit="deg"),
-            MetricTarget("travel_error_deg", 0.1, unit="deg"),
+            "nominal",
+            "perfectly known world: straight, S R60, L R20; chord 40, 60, 80 mm; nominal",
+            tuple(WeldCase(seam, chord_m=d) for seam in _EASY for d in CHORDS),
+            f"mean_mm 0.04 mean, max_mm 0.15, cv_percent 1.0, time_ratio 1.02{_SLOW}",
         ),
-    ),
+        (
+            "hard",
+            "perfectly known world, hard budget, chord 60 mm",
+            _of(_EASY, "hard"),
+            f"mean_mm 0.12 mean, max_mm 0.45{_SLOW}",
+        ),
+        (
+            "hard_corners",
+            "R5 and R1 corners, hard budget: completed",
+            _of(_CORNERS, "hard"),
+            f"mean_mm 0.12 mean{_SLOW}",
+        ),
+        ("r5", "L R5, nominal", _of(_CORNERS[:2]), f"max_mm 0.35{_SLOW}"),
+        ("r1_concave", "L R1 concave, nominal", _of(["l_r1_concave"]), f"max_mm 0.30{_SLOW}"),
+        ("r1_convex", "L R1 convex, nominal", _of(["l_r1_convex"]), f"max_mm 0.50{_SLOW}"),
+        (
+            "end",
+            "end of the seam: straight, on an R60 arc",
+            _of(["straight", "arc_r60_end"]),
+            "end_mm 0.12, end_step_mm_s 0.5",
+        ),
+        ("gap_10", "gap of 10 mm, straight and S", _of(_EASY[:2], gaps=_GAP_10), "gap_mm 0.12"),
+        ("gap_25", "gap of 25 mm, straight and S", _of(_EASY[:2], gaps=_GAP_25), "gap_mm 0.60"),
+        ("speed_16", "16 mm/s: S R60, L R20", _of(_EASY[1:], speed_m_s=0.016), f"max_mm 0.20{_SLOW}"),
+        ("speed_24", "24 mm/s: S R60, L R20", _of(_EASY[1:], speed_m_s=0.024), f"max_mm 0.35{_SLOW}"),
+        (
+            "space",
+            "on cylinders of R 150 and 300 mm, kinematic budget",
+            _of(_CURVED, "kinematic"),
+            "mean_mm 0.03 mean, space_mm 0.03, work_deg 3.0, travel_error_deg 0.1",
+        ),
+    )
 )
 
 _LAWS = ("printed", "literal", "open", "fixed", "dls", "guarded")
-COMPARED: tuple[WeldCase, ...] = tuple(
-    WeldCase(seam, law=law)
-    for seam in ("straight", "s_r60", "l_r20_convex", "l_r5_convex", "l_r1_convex", "l_r1_concave")
-    for law in _LAWS
-) + tuple(
+_SHAPES = ("straight", "s_r60", "l_r20_convex", "l_r5_convex", "l_r1_convex", "l_r1_concave")
+COMPARED: tuple[WeldCase, ...] = tuple(WeldCase(seam, law=law) for seam in _SHAPES for law in _LAWS) + tuple(
     WeldCase(seam, gaps=gaps, law=law)
     for seam, gaps in (("straight", _GAP_25), ("s_r60", _GAP_10), ("arc_r60_end", ()))
     for law in ("fixed", "fixed_zeroed", "guarded")
@@ -165,8 +133,11 @@ def get_rows(names: tuple[str, ...]) -> tuple[Row, ...]:
     return tuple(known[name] for name in names if name in known) if names else ROWS
 
 
-@dataclass(frozen=True)
-class Reached:
+Runs = dict[WeldCase, dict[int, RunMetrics]]
+"""The figures of every case by its seeds."""
+
+
+class Reached(NamedTuple):
     """One figure held against its target: the mean and the worst over all runs of the row, and which run was worst."""
 
     target: MetricTarget
@@ -175,104 +146,41 @@ class Reached:
     worst_run: str
 
     @property
-    def value(self) -> float:
-        """The number that the target speaks of."""
-        return self.worst if self.target.over == "worst" else self.mean
-
-    @property
     def met(self) -> bool:
         """Whether it is within the limit; what could not be measured is not."""
-        return self.value <= self.target.limit
+        return (self.worst if self.target.over == "worst" else self.mean) <= self.target.limit
 
 
-@dataclass(frozen=True)
-class CaseResult:
-    """All runs of one case: seeds and figures, in order."""
-
-    case: WeldCase
-    seeds: tuple[int, ...]
-    metrics: tuple[RunMetrics, ...]
-
-    @property
-    def completed(self) -> int:
-        """How many welds were completed."""
-        return sum(m.completed for m in self.metrics)
-
-    def figures(self, name: str) -> np.ndarray:
-        """One figure (n,) over the runs."""
-        return np.array([float(getattr(m, name)) for m in self.metrics])
-
-
-@dataclass(frozen=True)
-class RowResult:
-    """A row of the table, measured."""
-
-    row: Row
-    cases: tuple[CaseResult, ...]
-    reached: tuple[Reached, ...]
-
-    @property
-    def runs(self) -> int:
-        """How many welds there were."""
-        return sum(len(c.metrics) for c in self.cases)
-
-    @property
-    def completed(self) -> int:
-        """How many of them were completed."""
-        return sum(c.completed for c in self.cases)
-
-    @property
-    def met(self) -> bool:
-        """Whether every weld was completed and every target met."""
-        return self.completed == self.runs and all(r.met for r in self.reached)
-
-
-def hold_against(target: MetricTarget, cases: Iterable[CaseResult]) -> Reached:
+def hold_against(target: MetricTarget, runs: Runs) -> Reached:
     """A target's figure over all runs; a run that lacks it (it broke off before) counts as infinitely bad."""
     values = {
-        f"{c.case.name} seed {seed}": v if math.isfinite(v) else math.inf
-        for c in cases
-        for seed, v in zip(c.seeds, c.figures(target.figure).tolist(), strict=True)
+        f"{case.name} seed {seed}": v if math.isfinite(v := float(getattr(m, target.figure))) else math.inf
+        for case, of in runs.items()
+        for seed, m in of.items()
     }
     worst = max(values, key=lambda name: values[name])
     return Reached(target, float(np.mean(list(values.values()))), values[worst], worst)
 
 
-def measure_row(row: Row, results: dict[WeldCase, CaseResult]) -> RowResult:
-    """Return the row's table line from the results of its cases."""
-    cases = tuple(results[case] for case in row.cases)
-    return RowResult(row, cases, tuple(hold_against(t, cases) for t in row.targets))
-
-
 def run_cases(
     cases: Iterable[WeldCase],
-    seeds: tuple[int, ...],
-    keep: Callable[[WeldCase, int, StudyRun, RunMetrics], None],
+    seeds: Iterable[int],
+    keep: Callable[[WeldCase, int, StudyRun], None],
     progress: Progress,
-    known: dict[WeldCase, CaseResult] | None = None,
-) -> dict[WeldCase, CaseResult]:
-    """Return every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
-
-    What is `known` of the same seeds already is not run again.
-    """
+    runs: Runs,
+) -> Runs:
+    """Return every case over every seed; what ``runs`` has is not run again. `keep` sees each run as it ends."""
     wanted = list(dict.fromkeys(cases))
-    results = {}
     for k, case in enumerate(wanted):
-        if known and case in known and known[case].seeds[: len(seeds)] == seeds:
-            results[case] = CaseResult(case, seeds, known[case].metrics[: len(seeds)])
-            continue
-        metrics = []
-        for i, seed in enumerate(seeds):
-            progress(case.name, (k + i / len(seeds)) / len(wanted))
-            run, figures = run_case(case, seed)
-            keep(case, seed, run, figures)
-            metrics.append(figures)
-        results[case] = CaseResult(case, seeds, tuple(metrics))
-    return results
+        for seed in seeds:
+            progress(case.name, k / len(wanted))
+            if seed not in runs.setdefault(case, {}):
+                run, runs[case][seed] = run_case(case, seed)
+                keep(case, seed, run)
+    return {case: {seed: runs[case][seed] for seed in seeds} for case in wanted}
 
 
 TURNS = ("turn_120_r20", "turn_120_r5", "turn_150_r10", "u_r20", "u_r30", "u_r100", "cusp_r20")
-CHORDS = (0.040, 0.060, 0.080)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,243 +1,164 @@
 """Runs the weld study: its target table, the turns, the comparison of the laws, and one pictured run of each seam."""
 
 import math
-import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, astuple, fields
-from pathlib import Path
-from typing import Annotated
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
-from tests.figures.harness import RUNS, Figures, Measured, Study, Target, verdict
+from tests.figures.harness import Missed, Row, Run, figure
 from tests.figures.weld.rows import (
     CHORDS,
     COMPARED,
     TURNS,
-    CaseResult,
-    RowResult,
+    Runs,
     TurnResult,
     get_rows,
-    measure_row,
+    hold_against,
     run_cases,
     run_turn,
 )
-from tests.worlds.weld.case import RunMetrics, WeldCase, study_config
-from tests.worlds.weld.plant import COLUMNS, PHASES, StudyRun
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.console import Progress
+from tests.worlds.weld.case import WeldCase, study_config
+from tests.worlds.weld.plant import PHASES, StudyRun
 from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths
-from weldcal.tools.report.render import csv_text, fixed, write_atomic
+from weldcal.tools.report.render import fixed, mappings_csv
 from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
 
-COMPARED_SEEDS = 3
 
-
-@command("reproduce weld", short_help="Run the weld law in a small kinematic world.")
-def weld(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
-    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
-    quick: Annotated[
-        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
-    ] = False,
-) -> Outcome:
-    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures."""
-    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
-    names = tuple(name.strip() for name in rows.split(",") if name.strip())
-    return run_study(folder, names, number, call.seed, quick, call.progress).outcome()
-
-
-def run_study(
-    folder: Path, names: tuple[str, ...], count: int, first: int, quick: bool, progress: Progress
-) -> Measured:
-    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on.
-
-    Writes the tables, runs.csv, and one CSV and two pictures per pictured run.
-    """
-    start = time.monotonic()
-    everything = not names
-    rows = get_rows(names)
-    wanted = [case for row in rows for case in row.cases]
-    seeds = tuple(range(first, first + count))
+def study(run: Run, names: tuple[str, ...]) -> None:
+    """Run the rows of those names (all when none): tables, runs.csv, and two pictures of a run of each seam."""
+    rows, seeds = get_rows(names), tuple(run.seeds(1, 10))
     pictured: dict[str, tuple[WeldCase, StudyRun]] = {}
 
-    def keep(case: WeldCase, seed: int, run: StudyRun, figures: RunMetrics) -> None:
+    def keep(case: WeldCase, seed: int, found: StudyRun) -> None:
         # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
-        if seed == first and case.law == "guarded" and case.seam not in pictured:
-            pictured[case.seam] = (case, run)
+        if seed == run.seed and case.law == "guarded":
+            pictured.setdefault(case.seam, (case, found))
 
-    results = run_cases(wanted, seeds, keep, lambda name, share: progress(name, 0.7 * share))
-    turns: list[TurnResult] = []
-    if everything or "turns" in names:
-        chords = CHORDS[1:2] if quick else CHORDS
-        pairs = [(name, chord) for name in TURNS for chord in chords]
-        for k, (name, chord) in enumerate(pairs):
-            progress(name, 0.7 + 0.05 * k / len(pairs))
-            turns.append(run_turn(name, chord, first))
-    compared: dict[WeldCase, CaseResult] = {}
-    if everything or "laws" in names:
-        few = seeds[: 1 if quick else COMPARED_SEEDS]
-        compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)
-    measured = [measure_row(row, results) for row in rows] if results else []
-    write_atomic(folder / RUNS, runs_csv([*results.values(), *compared.values()]))
-    for case, run in pictured.values():
-        trace = weld_trace(run, study_config(case))
-        write_atomic(folder / "runs" / f"{case.name}.csv", run_csv(run))
-        write_atomic(folder / "figures" / f"{case.name}_paths.svg", paths(trace))
-        write_atomic(folder / "figures" / f"{case.name}_along.svg", along_the_weld(trace))
-    figures = {
-        "met": all(r.met for r in measured) and all(t.named and not t.stalled for t in turns),
-        "seeds": count,
-        "first_seed": first,
-        "rows": {r.row.key: _row_summary(r) for r in measured},
-        "turns": [asdict(t) | {"named": t.named, "stalled": t.stalled} for t in turns],
-        "laws": [
-            {"case": c.case.name, "law": c.case.law, "completed": c.completed, "runs": c.metrics}
-            for c in compared.values()
-        ],
-        "wall_seconds": time.monotonic() - start,
-        "written_to": folder,
-    }
-    study = Study(
-        name="weld",
-        what="The weld law in a small kinematic world: every target, turns, and the published law for comparison.",
-        figures=lambda results: figures,
-        header=("what", "figure", "target", "mean", "worst", "", "worst run"),
-        rows=lambda figures: table_lines(measured),
-        others=lambda figures: (
-            ("Turns, U-turns and cusps", TURN_HEADER, turn_lines(turns)),
-            ("Comparison of the laws", LAW_HEADER, compared_lines(compared.values())),
-        ),
-        targets=_missed,
-        group="reproduce",
-    )
-    return study.measured({}, folder)
+    runs: Runs = {}
+    lines, missed = [], 0
+    for row in rows:
+        of = run_cases(row.cases, seeds, keep, run.progress, runs)
+        broken = [
+            f"{case.name} seed {s}: {m.reason or m.phase}"
+            for case in of
+            for s, m in of[case].items()
+            if not m.completed
+        ]
+        whole = len(of) * len(seeds)
+        done = f"{whole - len(broken)} of {whole}"
+        lines.append((row.label, "completed", "all", done, "", verdict(not broken), "".join(broken[:1])))
+        missed += len(broken)
+        for r in (hold_against(target, of) for target in row.targets):
+            name, unit = FIGURE_NAMES[r.target.figure]
+            bound = f"{r.target.over} ≤ {r.target.limit:g}{unit}"
+            lines.append(("", name, bound, fixed(r.mean, 3), fixed(r.worst, 3), verdict(r.met), r.worst_run))
+            missed += not r.met
+    run.table("", ("what", "figure", "target", "mean", "worst", "", "worst run"), lines)
+    if not names or "turns" in names:
+        chords = run.size(CHORDS[1:2], CHORDS)
+        turns = [run_turn(name, chord, run.seed) for name in TURNS for chord in chords]
+        run.table("Turns, U-turns and cusps", TURN_HEADER, turn_lines(turns))
+        missed += sum(not t.named or t.stalled for t in turns)
+    if not names or "laws" in names:
+        run.table(
+            "Comparison of the laws",
+            LAW_HEADER,
+            compared_lines(run_cases(COMPARED, seeds[:3], keep, run.progress, runs)),
+        )
+    run.write("runs.csv", runs_csv(runs))
+    for case, weld in pictured.values():
+        trace = weld_trace(weld, study_config(case))
+        run.write(f"{case.name}_paths.svg", paths(trace))
+        run.write(f"{case.name}_along.svg", along_the_weld(trace))
+    if missed:
+        raise Missed(f"{missed} figures, welds or turns missed their targets; see the tables.")
 
 
-def _missed(figures: Figures) -> list[Target]:
-    """Every weld is to be completed, every target met, and every impossible turn refused."""
-    bad = [row for row in figures["rows"].values() if not row["met"]]
-    bad += [turn for turn in figures["turns"] if not turn["named"] or turn["stalled"]]
-    return [Target("rows and turns that missed", "", len(bad), 0.0)]
+@figure("weld", "the weld law in a small kinematic world: every target, turns, the published laws beside it")
+def weld(run: Run) -> None:
+    """Run all rows; in the quick form one seed of each weld."""
+    study(run, ())
 
 
-def _row_summary(row: RowResult) -> dict[str, object]:
-    return {
-        "label": row.row.label,
-        "met": row.met,
-        "runs": row.runs,
-        "completed": row.completed,
-        "figures": {
-            r.target.figure: {
-                "target": r.target.limit,
-                "over": r.target.over,
-                "unit": r.target.unit,
-                "mean": r.mean,
-                "worst": r.worst,
-                "met": r.met,
-                "worst_run": r.worst_run,
-            }
-            for r in row.reached
-        },
-    }
+@figure("weld-imperfect", "the weld law where time stamps, walls, tip radius, seat and lag have errors")
+def weld_imperfect(run: Run) -> None:
+    """Run the row of the imperfect world."""
+    study(run, ("imperfect",))
+
+
+@figure("weld-laws", "the steering laws of the paper beside weldcal's")
+def weld_laws(run: Run) -> None:
+    """Compare the laws."""
+    study(run, ("laws",))
 
 
 FIGURE_NAMES = {
-    "mean_mm": "torch, mean",
-    "max_mm": "torch, largest",
-    "space_mm": "torch in space, largest",
-    "space_mean_mm": "torch in space, mean",
-    "height_mm": "torch height, largest",
-    "end_mm": "last chord, largest",
-    "gap_mm": "gap and 60 mm after, largest",
-    "cv_percent": "torch speed CV",
-    "time_ratio": "time over L/V",
-    "omega_rad_s": "turning rate",
-    "tip_speed_mm_s": "tip speed",
-    "end_step_mm_s": "robot's velocity step",
-    "work_deg": "work angle",
-    "travel_error_deg": "travel angle against prediction",
+    "mean_mm": ("torch, mean", " mm"),
+    "max_mm": ("torch, largest", " mm"),
+    "space_mm": ("torch in space, largest", " mm"),
+    "space_mean_mm": ("torch in space, mean", " mm"),
+    "height_mm": ("torch height, largest", " mm"),
+    "end_mm": ("last chord, largest", " mm"),
+    "gap_mm": ("gap and 60 mm after, largest", " mm"),
+    "cv_percent": ("torch speed CV", " %"),
+    "time_ratio": ("time over L/V", ""),
+    "omega_rad_s": ("turning rate", " rad/s"),
+    "tip_speed_mm_s": ("tip speed", " mm/s"),
+    "end_step_mm_s": ("robot's velocity step", " mm/s"),
+    "work_deg": ("work angle", " deg"),
+    "travel_error_deg": ("travel angle against prediction", " deg"),
 }
+
+
+def verdict(met: bool) -> str:
+    """Return the word for a target that is met or missed."""
+    return "met" if met else "MISSED"
 
 
 TURN_HEADER = ("seam", "chord mm", "turn deg", "back-up mm", "for a trailing torch", "what was done")
 LAW_HEADER = (
-    "weld",
-    "law",
-    "mean mm",
-    "largest mm",
-    "omega rad/s",
-    "speed CV %",
-    "torch mm/s",
-    "outside ±25 % mm",
-    "completed",
+    *("weld", "law", "mean mm", "largest mm", "omega rad/s", "speed CV %", "torch mm/s"),
+    *("outside ±25 % mm", "completed"),
 )
 
 
-def table_lines(rows: Iterable[RowResult]) -> list[tuple[str, str, str, str, str, str, str]]:
-    """Return the target table as text: what, figure, target, mean, worst, whether met, and the worst run."""
-    lines = []
-    for row in rows:
-        done = f"{row.completed} of {row.runs}"
-        lines.append(
-            (row.row.label, "completed", "all", done, "", verdict(row.completed == row.runs), _first_stop(row))
-        )
-        for r in row.reached:
-            unit = {"L/V": "", "%": " %"}.get(r.target.unit, f" {r.target.unit}")
-            target = f"{r.target.over} ≤ {r.target.limit:g}{unit}"
-            name = FIGURE_NAMES.get(r.target.figure, r.target.figure)
-            lines.append(("", name, target, fixed(r.mean, 3), fixed(r.worst, 3), verdict(r.met), r.worst_run))
-    return lines
-
-
-def _first_stop(row: RowResult) -> str:
-    for c in row.cases:
-        for seed, m in zip(c.seeds, c.metrics, strict=True):
-            if not m.completed:
-                return f"{c.case.name} seed {seed}: {m.reason or m.phase}"
-    return ""
-
-
-def compared_lines(results: Iterable[CaseResult]) -> list[tuple[str, ...]]:
+def compared_lines(runs: Runs) -> Iterable[Row]:
     """Compare the laws: seam, law, mean, largest, peak turn rate, speed range, weld outside the band, completed."""
-
-    def over_runs(c: CaseResult, name: str, digits: int, statistic: Callable[[np.ndarray], object] = np.max) -> str:
-        good = c.figures(name)[np.isfinite(c.figures(name))]
-        return fixed(float(statistic(good)) if len(good) else None, digits)  # type: ignore[arg-type]
-
-    return [
-        (
-            c.case.name.removesuffix(f"-{c.case.law}"),
-            c.case.law,
-            over_runs(c, "mean_mm", 3, np.mean),
-            over_runs(c, "max_mm", 2),
-            over_runs(c, "omega_rad_s", 2),
-            over_runs(c, "cv_percent", 1),
-            f"{over_runs(c, 'slowest_mm_s', 1, np.min)} to {over_runs(c, 'fastest_mm_s', 1)}",
-            over_runs(c, "outside_mm", 1),
-            f"{c.completed} of {len(c.metrics)}",
-        )
-        for c in results
-    ]
+    for case, of in runs.items():
+        statistics = {
+            name: [v for m in of.values() if math.isfinite(v := float(getattr(m, name)))] for name in LAW_FIGURES
+        }
+        values = {
+            name: fixed(float(LAW_FIGURES[name][0](v)) if v else None, LAW_FIGURES[name][1])
+            for name, v in statistics.items()
+        }
+        mean, largest, omega, cv, slowest, fastest, outside = values.values()
+        done = f"{sum(m.completed for m in of.values())} of {len(of)}"
+        title = case.name.removesuffix(f"-{case.law}")
+        yield title, case.law, mean, largest, omega, cv, f"{slowest} to {fastest}", outside, done
 
 
-def turn_lines(turns: Iterable[TurnResult]) -> list[tuple[str, ...]]:
+LAW_FIGURES: dict[str, tuple[Callable[[list[float]], Any], int]] = {
+    "mean_mm": (np.mean, 3),
+    "max_mm": (np.max, 2),
+    "omega_rad_s": (np.max, 2),
+    "cv_percent": (np.max, 1),
+    "slowest_mm_s": (np.min, 1),
+    "fastest_mm_s": (np.max, 1),
+    "outside_mm": (np.max, 1),
+}
+
+
+def turn_lines(turns: Iterable[TurnResult]) -> Iterable[Row]:
     """One line per turn and chord."""
-    return [
-        (
-            t.seam,
-            fixed(t.chord_mm, 0),
-            fixed(t.turn_deg, 0),
-            fixed(t.back_up_mm, 1),
-            "possible" if t.possible else "impossible",
-            t.outcome,
-        )
-        for t in turns
-    ]
+    for t in turns:
+        numbers = (fixed(t.chord_mm, 0), fixed(t.turn_deg, 0), fixed(t.back_up_mm, 1))
+        yield t.seam, *numbers, "possible" if t.possible else "impossible", t.outcome
 
 
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s
@@ -292,21 +213,12 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
     )
 
 
-def runs_csv(results: Iterable[CaseResult]) -> str:
+def runs_csv(runs: Runs) -> str:
     """One line per run: case, seed and every figure."""
-    header = ["case", "seam", "budget", "chord_mm", "speed_mm_s", "law", "seed", *(f.name for f in fields(RunMetrics))]
-    lines: list[tuple[object, ...]] = []
-    for result in results:
-        c = result.case
-        head = (c.name, c.seam, c.budget, 1e3 * c.chord_m, 1e3 * c.speed_m_s, c.law)
-        lines += [(*head, seed, *astuple(m)) for seed, m in zip(result.seeds, result.metrics, strict=True)]
-    return csv_text(header, lines)
-
-
-def run_csv(run: StudyRun) -> str:
-    """One run, a line per servo tick; units in the header's names, positions in m."""
-    k = COLUMNS.index("phase")
-    lines = [[f"{v:.7g}" for v in row] for row in run.table.tolist()]
-    for line, phase in zip(lines, run.column("phase"), strict=True):
-        line[k] = PHASES[int(phase)].value
-    return csv_text(COLUMNS, lines)
+    return mappings_csv(
+        [
+            {"case": case.name, "law": case.law, "seed": seed, **asdict(m)}
+            for case in runs
+            for seed, m in runs[case].items()
+        ]
+    )

@@ -1,6 +1,6 @@
 """A V-groove is measured from the cloud alone, with a sigma that holds; what is no groove is refused by name.
 
-Accuracy on poses that no figure was set on is what `./tools/run figures benchmark seam-planning` is for.
+Accuracy on poses that no figure was set on is what `./tools/run figures seam-planning` is for.
 """
 
 from __future__ import annotations

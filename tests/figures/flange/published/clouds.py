@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,18 +114,15 @@ class CloudsOutcome:
     n_fit: int
 
     @property
-    def circle_repeat_mm(self) -> float:
-        """Rms (3-D) of the published centres of one cloud over seeds."""
-        return 1e3 * float(np.sqrt(np.mean([r.repeat_m**2 for r in self.circles])))
+    def circle_row(self) -> tuple[str, ...]:
+        """Of the published circle, mm: rms of its centres over seeds, and their mean offset in the flange's axes.
 
-    @property
-    def circle_bias_R_mm(self) -> Array:
-        """Mean offset (3,) of the published centres in the axes of the flange."""
-        return np.asarray(1e3 * np.mean([r.offset_R for r in self.circles], axis=0))
-
-    def halves_mm(self, method: Literal["published", "ours"]) -> float:
-        """Median distance between the centres from two halves of a cloud."""
-        return 1e3 * float(np.median([getattr(r, f"halves_{method}_m") for r in self.circles]))
+        Then the median distance of the centres from two halves of a cloud: published, and by weldcal's edges.
+        """
+        repeat = np.sqrt(np.mean([r.repeat_m**2 for r in self.circles]))
+        offset = np.mean([r.offset_R for r in self.circles], axis=0)
+        halves = (np.median([getattr(r, f"halves_{m}_m") for r in self.circles]) for m in ("published", "ours"))
+        return tuple(f"{1e3 * v:.3f}" for v in (repeat, *offset, *halves))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

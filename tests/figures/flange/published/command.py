@@ -1,20 +1,18 @@
 """Repeats the flange paper: simulation, the authors' runs, both methods on real scans, and Table 2 in a made cell."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.figures.flange.published.clouds import CloudsOutcome, study_clouds
 from tests.figures.flange.published.pairs import KinectOutcome, PairsOutcome, load_runs, study_kinect, study_pairs
 from tests.figures.flange.published.report import COST_HEADER, PublishedResults, cost_rows, pictures, tables
 from tests.figures.flange.published.simulation import simulate
-from tests.figures.harness import Study
+from tests.figures.harness import Run, figure
 from tests.worlds.flange_frames import P_FS, SphereScan, cell_scans
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
@@ -27,7 +25,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.report.render import statistics
 
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}
@@ -58,7 +55,7 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
 
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
-) -> tuple[list[dict[str, object]], dict[str, object]]:
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Compare sphere and flange in the same scans with 4 and 16 pairs; also Table 1's false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
@@ -91,7 +88,7 @@ def compare_sphere(
     return rows, false_segmentations([s.flange for s in scans], seed)
 
 
-def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[str, object]:
+def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[str, Any]:
     """Table 1's UR5: the same share of pairs (3 of 54) from another part of the arm, a link behind the flange.
 
     Each false centre lies 60 to 160 mm behind and beside the flange, as a wrist's tube does. The errors are those of
@@ -121,34 +118,6 @@ def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[s
         "named": len(named & wrong),
         "named_wrongly": len(named - wrong),
     }
-
-
-def run_sphere_study(scans: int, draws: int, seed: int, progress: Progress = no_progress) -> dict[str, object]:
-    """Return the comparison as a JSON object, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
-    rows, false = compare_sphere(seed, draws, scans, progress)
-    return {
-        "scans": scans,
-        "draws": draws,
-        "rows": rows,
-        "paper_table2": {str(n): list(v) for n, v in TABLE2.items()},
-        "false_segmentations": false,
-    }
-
-
-def sphere_rows(summary: dict[str, Any]) -> dict[str, str]:
-    """Rows for the terminal."""
-    rows = {
-        f"{r['method']}, {r['pairs']} pairs": (
-            f"median {r['median_mm']:.2f} mm, 95 % {r['p95_mm']:.2f} mm, largest {r['max_mm']:.2f} mm"
-        )
-        for r in summary["rows"]
-    }
-    f = summary["false_segmentations"]
-    rows["false segmentations"] = (
-        f"{f['false']} of {f['pairs']} pairs: least squares {f['svd_mm']:.1f} mm, weldcal {f['robust_mm']:.2f} mm,"
-        f" {f['named']} named"
-    )
-    return rows
 
 
 NO_DATA = (
@@ -233,56 +202,34 @@ def title(data: Dataset) -> str:
     return f"{robot} & {scanner[:-1] + scanner[-1].upper() if 'PhoXi' in scanner else scanner}"
 
 
-@command("reproduce flange", short_help="Repeat the flange paper: tables, figures, Kinect data.")
-def flange(
-    call: Call,
-    data: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[DATA]",
-            help="Folder of the recorded datasets. Without it only the simulated parts are run.",
-            show_default=False,
-        ),
-    ] = None,
-    quick: Annotated[bool, switch("--quick", "Fewer noise levels, realisations, shuffled orders and splits.")] = False,
-) -> Outcome:
-    """Repeat the flange paper: Table 1, Fig. 9, 10 and 11, the Kinect data, and the effect of Algorithm 1's cost."""
-    folder = call.folder("reproduce", "flange")
-    start = time.monotonic()
-    found = compute(data, call.seed, quick, call.progress)
-    more = {"quick": quick, "seed": call.seed, "wall_seconds": time.monotonic() - start, "written_to": folder}
-    paper = Study(
-        name="flange",
-        what="The flange paper repeated: the effect of Algorithm 1's cost (simulated, 1 mm of noise), and its data.",
-        group="reproduce",
-        figures=lambda results: {**found.summary(), **more},
-        header=COST_HEADER,
-        rows=lambda figures: cost_rows(found),
-        others=lambda figures: tables(found),
-        numbers=len(COST_HEADER) - 1,
-        plots=pictures(found),
-    )
-    return paper.measured({}, folder).outcome()
+@figure("flange", "the flange paper repeated: Table 1, Fig. 9, 10 and 11, the Kinect data, the effect of the cost")
+def flange(run: Run) -> None:
+    """Repeat the flange paper; without --data only the simulated parts."""
+    found = compute(run.data, run.seed, not run.full, run.progress)
+    run.table("The effect of Algorithm 1's cost (simulated, 1 mm of noise)", COST_HEADER, cost_rows(found))
+    ratio = "  ".join(f"{v:.1f}" for v in found.simulation.ratio)
+    run.say(f"Fig. 9: spread of all pairs over that of Algorithm 1, roll pitch yaw x y z: {ratio}\n")
+    for title, header, rows in tables(found):
+        run.table(title, header, rows)
+    for name, draw in pictures(found).items():
+        run.write(name, draw())
 
 
-@command("reproduce flange-sphere", short_help="Repeat Table 2 of the flange paper with a sphere.")
-def flange_sphere(
-    call: Call,
-    scans: Annotated[int, option("--scans", "N", "Scans of the flange with a sphere on it.", min=20)] = 48,
-    draws: Annotated[int, option("--draws", "N", "Random draws of 4 and of 16 of them.", min=1)] = 40,
-) -> Outcome:
-    """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same
-    scans; and the false segmentations of Table 1."""
-    folder = call.folder("reproduce", "flange-sphere")
-    summary = run_sphere_study(scans, draws, call.seed, call.progress)
-    sphere = Study(
-        name="flange-sphere",
-        what=(
-            "Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same"
-            " scans."
-        ),
-        group="reproduce",
-        header=("calibration", "error at the flange"),
-        rows=lambda figures: sphere_rows(summary).items(),
+@figure(
+    "flange-sphere", "Table 2 of the flange paper in a simulated cell: a sphere beside the flange, in the same scans"
+)
+def flange_sphere(run: Run) -> None:
+    """Compare sphere and flange, and name the false segmentations of Table 1."""
+    scans, draws = run.size((20, 3), (48, 40))
+    found, f = compare_sphere(run.seed, draws, scans, run.progress)
+    rows = [
+        (f"{r['method']}, {r['pairs']} pairs", *(f"{r[k]:.2f}" for k in ("median_mm", "p95_mm", "max_mm")))
+        for r in found
+    ]
+    for n, paper in TABLE2.items():
+        rows.append((f"the paper's Table 2, {n} pairs: x, y, z", *(f"{abs(v):.2f}" for v in paper[:3])))
+    run.table("", ("calibration", "median mm", "95 % mm", "largest mm"), rows)
+    run.say(
+        f"{f['false']} false of {f['pairs']} pairs: least squares {f['svd_mm']:.1f} mm, weldcal {f['robust_mm']:.2f} mm,"
+        f" {f['named']} named"
     )
-    return sphere.found(summary, folder)

@@ -11,9 +11,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from tests.figures.flange.published.clouds import METHODS, CloudsOutcome
-from tests.figures.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
-from tests.figures.flange.published.simulation import COSTS, Errors, Simulation
-from tests.figures.harness import Results, Row, Table
+from tests.figures.flange.published.pairs import KinectOutcome, PairsOutcome
+from tests.figures.flange.published.simulation import COSTS, Simulation
+from tests.figures.harness import Row
 from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, statistics
@@ -37,75 +37,10 @@ class PublishedResults:
     kinect: tuple[KinectOutcome, ...]
     notes: tuple[str, ...]
 
-    def summary(self) -> dict[str, object]:
-        """Return the result for JSON: millimetres and degrees where the key says so."""
-        sim, axes = self.simulation, ("roll", "pitch", "yaw", "x", "y", "z")
-        return {
-            "notes": self.notes,
-            "simulation": {
-                "std_ratio_all_over_algorithm1": dict(zip(axes, sim.ratio, strict=True)),
-                "at_1mm": {name: _errors(e) for name, e in sim.costs.items()},
-            },
-            "paper_table1": {name: {"xyz_mm": v[:3], "rpy_deg": v[3:]} for name, v in TABLE1.items()},
-            "pairs": {p.name: _pairs(p) for p in self.pairs},
-            "clouds": {c.name: _clouds(c) for c in self.clouds},
-            "kinect": {
-                k.name: {
-                    "n": k.n,
-                    "paper_e": {"xyz_mm": PAPER_E_XYZ_MM, "rpy_deg": PAPER_E_RPY_DEG},
-                    "residual_mm": in_mm(k.residual),
-                    "held_out_mm": in_mm(k.held_out),
-                    "weldcal_held_out_mm": in_mm(k.ours),
-                    "compensated_mm": in_mm(k.compensated),
-                    "e_at_camera_mm": 1e3 * k.at_camera_m,
-                    "e_at_work_mm": 1e3 * k.shift_m,
-                }
-                for k in self.kinect
-            },
-        }
-
 
 def in_mm(errors_m: Array) -> dict[str, float]:
     """Median, mean and 95 % in mm, NaN left out."""
     return statistics(1e3 * errors_m, "median", "mean", "p95")
-
-
-def _errors(e: Errors) -> dict[str, object]:
-    at_tcp = 1e3 * e.at_tcp
-    return {
-        "std_xyz_mm": 1e3 * e.e[:, 3:].std(axis=0, ddof=1),
-        "std_rpy_deg": np.degrees(e.e[:, :3].std(axis=0, ddof=1)),
-        "true_mm": {"mean": at_tcp.mean(), "worst_run": at_tcp.mean(axis=1).max(), "max": at_tcp.max()},
-    }
-
-
-def _pairs(p: PairsOutcome) -> dict[str, object]:
-    return {
-        "n": p.n,
-        "outliers": p.outliers,
-        "table1_xyz_mm": None if p.table1 is None else 1e3 * p.table1[3:],
-        "table1_rpy_deg": None if p.table1 is None else np.degrees(p.table1[:3]),
-        "algorithm1_reports_mm": None if p.runs is None else p.reported_mm,
-        "algorithm1_own_four_mm": in_mm(p.own_pool),
-        "algorithm1_true_mm": in_mm(p.true),
-        "svd_held_out_mm": in_mm(p.svd),
-        "weldcal_held_out_mm": in_mm(p.ours),
-    }
-
-
-def _clouds(c: CloudsOutcome) -> dict[str, object]:
-    return {
-        "n": c.n,
-        "verification": c.verification,
-        "n_fit": c.n_fit,
-        "circle_repeat_mm": c.circle_repeat_mm,
-        "circle_bias_R_mm": c.circle_bias_R_mm,
-        "circle_halves_mm": c.halves_mm("published"),
-        "edges_halves_mm": c.halves_mm("ours"),
-        "held_out_mm": {s.name: in_mm(s.held_out) for s in c.splits},
-        "reported_mm": {s.name: 1e3 * s.reported for s in c.splits},
-        "sight": {r.title: {"share": r.share, "value": r.value, "blind": r.blind} for r in c.sights},
-    }
 
 
 # the paper's order and grouping: x, y, z above roll, pitch, yaw
@@ -299,6 +234,7 @@ COST_HEADER = ("chosen by", *_SIX, "true mm", "worst mm")
 HELD_HEADER = ("calibration", "reported mm", "median mm", "mean mm", "95 % mm", "true / reported")
 KINECT_HEADER = ("calibration", "median mm", "mean mm", "95 % mm")
 SIGHT_HEADER = ("registration", "tilt x", "tilt y", "turn", "in x", "in y", "normal", "reports mm", "unobservable")
+CIRCLE_HEADER = ("repeats", "off in x", "y", "z", "two halves apart", "the same by weldcal's edges")
 SHORT = {
     "rotation about the flange axis": "turn",
     "in the flange plane, x": "plane x",
@@ -380,15 +316,16 @@ def kinect_rows(study: PublishedResults) -> list[Row]:
     ]
 
 
-def tables(study: PublishedResults) -> list[Table]:
+def tables(study: PublishedResults) -> list[tuple[str, Row, list[Row]]]:
     """Return every table of the study that has lines."""
-    found: list[Table] = []
+    found: list[tuple[str, Row, list[Row]]] = []
     if study.pairs or study.clouds:
         found.append(("Table 1: all pairs, no iteration", TABLE1_HEADER, table1_rows(study)))
     found.append(("Centre pairs: errors on pairs outside the fit", HELD_HEADER, pairs_rows(study)))
     for c in study.clouds:
         found.append((f"{c.title}: fitted on {c.n_fit} scans, judged on the others", HELD_HEADER, held_out_rows(c)))
         found.append((f"{c.title}: share of a known error that a registration reports", SIGHT_HEADER, sight_rows(c)))
+        found.append((f"{c.title}: centre of the published circle, mm", CIRCLE_HEADER, [c.circle_row]))
     found.append(("Azure Kinect: errors at the wrist ring", KINECT_HEADER, kinect_rows(study)))
     found.append(("Notes", ("data",), [(note,) for note in study.notes]))
     return [table for table in found if table[2]]
@@ -410,7 +347,7 @@ def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int
     return (name, fixed(reported_mm, digits), *_numbers(true.values(), digits), ratio)
 
 
-def pictures(study: PublishedResults) -> dict[str, Callable[[Results], bytes]]:
+def pictures(study: PublishedResults) -> dict[str, Callable[[], bytes]]:
     """What draws every figure, by the name of its file."""
     sim = study.simulation
     drawn: dict[str, Callable[[], bytes]] = {
@@ -420,8 +357,6 @@ def pictures(study: PublishedResults) -> dict[str, Callable[[Results], bytes]]:
     }
     drawn |= {f"fig11_{p.name}": partial(fig11_stored, p) for p in study.pairs if p.runs is not None}
     for c in study.clouds:
-        drawn[f"fig11_{c.name}"] = partial(fig11_rerun, c)
-        drawn[f"held_out_{c.name}"] = partial(held_out, c)
+        drawn |= {f"fig11_{c.name}": partial(fig11_rerun, c), f"held_out_{c.name}": partial(held_out, c)}
         drawn[f"circles_{c.name}"] = partial(circles, c)
-    figures = {f"figures/{name}.svg": draw for name, draw in drawn.items()}
-    return {path: lambda results, draw=draw: draw() for path, draw in figures.items()}  # type: ignore[misc]
+    return {f"{name}.svg": draw for name, draw in drawn.items()}
