@@ -16,10 +16,9 @@ from weldcal.calibration.data.results import matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import InconsistentPoses, ScannerMoved
 from weldcal.calibration.eye_on_base.change_point import ChangePoint, find_change
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, corrected_observation
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, calibrate_from_few
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.tcp import TcpOffset, find_tcp
 from weldcal.calibration.flange.holes import HolePattern

@@ -17,7 +17,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State, Verification
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.welding.locate.part.joint import FitUp
+from weldcal.welding.locate.part.fit_up import FitUp
 from weldcal.welding.passes.angles import AnglesAlong
 from weldcal.welding.record.schedule import GapAlong
 from weldcal.welding.seam.curve import SeamCurve

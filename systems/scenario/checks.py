@@ -16,10 +16,11 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.models.workpieces.reading import LARGEST_SIZE_M
 from weldcal.systems.drivers.config import NoDevice, check_range
-from weldcal.systems.jobs.job import job_of, jobs
+from weldcal.systems.jobs.job import job_of
+from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
-from weldcal.welding.locate.part.joint import SHOWN_BY
+from weldcal.welding.locate.part.fit_up import SHOWN_BY
 from weldcal.welding.record.schedule import VALUES
 from weldcal.welding.servo.laws import get_law
 
@@ -351,6 +352,61 @@ def check_angles_order(scenario: Scenario) -> None:
             )
 
 
+def check_devices(scenario: Scenario, key: str) -> None:
+    """Check that scanner, second robot, tool and profiler belong to the job with this key.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    scanner = scenario.scanner_config()
+    if key in ("mounting", "profiler_job", "tablet") and scanner is not None and scanner.stream_delay_s() is not None:
+        raise InputError(
+            "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job: write"
+            " motion: {} or another scanner."
+        )
+    check_mounting(
+        scenario.calibration.configuration,
+        scenario.part(MountingJob),
+        "base" if scanner is None else scanner.mounted_on,
+        second_robot=not isinstance(scenario.robot_2, NoDevice),
+        weld=scenario.job.weld,
+    )
+    if key != "profiler_job" and not isinstance(scenario.profiler, NoDevice):
+        raise InputError("A profiler needs a job: write profiler_job: {} in the scenario.")
+    if key != "tablet" and scenario.tool == "pen":
+        raise InputError("A pen touches a tablet: write tablet: {} in the scenario, or another tool.")
+
+
+def check_scan_poses(scenario: Scenario) -> None:
+    """Check the scan poses of the workpiece, and that the pose of a scanner on the flange is known.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    job, poses, scanner = scenario.job, scenario.planning.scan_poses_deg, scenario.scanner_config()
+    on_flange = scanner is not None and scanner.mounted_on == "flange"
+    if poses and not on_flange:
+        raise InputError(
+            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the"
+            " arm has one view: remove the list, or let the arm carry the scanner."
+        )
+    if on_flange and job.weld and (job.calibrate or job.X_FC is None):
+        nominal = scenario.calibration.mounting_guess
+        raise InputError(
+            "A weld with the scanner on the flange needs its pose there. Calibrate with the scenario eye_in_hand first."
+            f" Then write, with its numbers: job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
+            f" {nominal.rpy_deg}}}}}"
+        )
+    if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
+        raise InputError(
+            "planning.scan_poses_deg: several poses are for a part from a file; write one pose for a plate."
+        )
+    for k, pose in enumerate(poses):
+        if len(pose) != 6:
+            raise InputError(f"planning.scan_poses_deg[{k}] must hold 6 angles, not {len(pose)}.")
+        check_home(pose, scenario.arm, f"planning.scan_poses_deg[{k}]")
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check the parts of a scenario against each other.
 
@@ -369,8 +425,9 @@ def check_scenario(scenario: Scenario) -> None:
             f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or"
             " calibrate with the default job (job.weld: false)."
         )
-    for job in jobs():
-        job.check(scenario)
+    check_devices(scenario, found.key)
+    check_scan_poses(scenario)
+    found.check(scenario)
     if not found.key and not scenario.job.calibrate and not scenario.job.weld:
         raise InputError("This scenario has nothing to do: set job.calibrate or job.weld to true.")
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):

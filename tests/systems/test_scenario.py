@@ -378,7 +378,7 @@ def test_one_word_changes_the_robot_and_none_of_its_options_is_lost() -> None:
     assert compare(UrRtde, text, loaded.robot, UrRtde()) == []
     shipped = load_scenario("s_groove")
     loaded.robot = shipped.robot
-    assert loaded == shipped
+    assert vars(loaded) == vars(shipped)
 
 
 def test_a_device_can_be_said_to_be_absent() -> None:

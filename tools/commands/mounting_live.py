@@ -16,8 +16,9 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import unit_quaternion
 from weldcal.calibration.data.clouds import CloudError
-from weldcal.calibration.data.dataset import JOINTS, SECOND_JOINTS, Dataset, load_dataset, save_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess, SecondRobot
+from weldcal.calibration.data.writing import JOINTS, SECOND_JOINTS, save_dataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.planning.mounting_estimate import (

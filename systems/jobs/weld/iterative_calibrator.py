@@ -9,9 +9,8 @@ from pydrake.systems.framework import Context, State
 
 from weldcal.calibration.calibrate import PLAIN, Refined, Steps, calibrate
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import sigma_at
+from weldcal.calibration.eye_on_base.estimate import corrected_observation, sigma_at
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma

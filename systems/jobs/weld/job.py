@@ -26,7 +26,6 @@ from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
     calibrator_config,
     check_scan_moves,
-    check_scan_poses,
     feature_on_flange,
     feature_standard,
     job_plan,
@@ -49,7 +48,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
-from weldcal.welding.locate.part.joint import read_limits
+from weldcal.welding.locate.part.fit_up import read_limits
 from weldcal.welding.passes.travel import SeamTravel
 from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.settings import ServoConfig
@@ -236,10 +235,6 @@ class WeldJob(AddedJob):
 
 class Weld(Job[tuple[PlannedPose, ...]]):
     """The default job: that of a scenario without another job's part."""
-
-    def check(self, scenario: Scenario) -> None:
-        """See Job; check_scenario contains this job's other checks."""
-        check_scan_poses(scenario)
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
         """See Job: every calibration and verification pose."""

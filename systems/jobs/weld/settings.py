@@ -28,7 +28,6 @@ from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorCon
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
-from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import AnglesOrder, Scenario, WeldingConfig
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
@@ -302,36 +301,6 @@ def _telling_of_the_arm(
         guess, kind = scenario.calibration.mounting_guess.pose(), scenario.calibration.refine
         return [pool[i] for i in informative_poses(chain_of(station.arm), guess, q, wanted, kind)]
     return planned(config, wanted)
-
-
-def check_scan_poses(scenario: Scenario) -> None:
-    """Check the scan poses of the workpiece, and that the pose of a scanner on the flange is known.
-
-    Raises:
-        InputError: one sentence that says what to change.
-    """
-    job, poses, scanner = scenario.job, scenario.planning.scan_poses_deg, scenario.scanner_config()
-    on_flange = scanner is not None and scanner.mounted_on == "flange"
-    if poses and not on_flange:
-        raise InputError(
-            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the"
-            " arm has one view: remove the list, or let the arm carry the scanner."
-        )
-    if on_flange and job.weld and (job.calibrate or job.X_FC is None):
-        nominal = scenario.calibration.mounting_guess
-        raise InputError(
-            "A weld with the scanner on the flange needs its pose there. Calibrate with the scenario eye_in_hand first."
-            f" Then write, with its numbers: job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
-            f" {nominal.rpy_deg}}}}}"
-        )
-    if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
-        raise InputError(
-            "planning.scan_poses_deg: several poses are for a part from a file; write one pose for a plate."
-        )
-    for k, pose in enumerate(poses):
-        if len(pose) != 6:
-            raise InputError(f"planning.scan_poses_deg[{k}] must hold 6 angles, not {len(pose)}.")
-        check_home(pose, scenario.arm, f"planning.scan_poses_deg[{k}]")
 
 
 def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
