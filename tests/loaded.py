@@ -18,6 +18,8 @@ from typer.testing import CliRunner
 
 from tests.places import ROOT
 
+SHOWN = 40  # modules that are loaded and not entered
+
 
 class Entered:
     """A profile function that keeps the code objects of weldcal's functions that were called."""
@@ -30,8 +32,8 @@ class Entered:
         if event == "call":
             self.codes.add(frame.f_code)
 
-    def lines(self) -> tuple[int, int]:
-        """Lines of the entered functions without those inside them twice, and the modules that they are in."""
+    def lines(self) -> dict[str, int]:
+        """Lines of the entered functions, those inside them once, by file."""
         found: dict[str, set[int]] = {}
         functions: dict[str, dict[int, int]] = {}
         for code in self.codes:
@@ -42,7 +44,7 @@ class Entered:
                 end = functions[path].get(code.co_firstlineno)
                 if end is not None:
                     found.setdefault(path, set()).update(range(code.co_firstlineno, end + 1))
-        return sum(map(len, found.values())), len(found)
+        return {path: len(lines) for path, lines in found.items()}
 
 
 def _own(path: str) -> bool:
@@ -61,12 +63,13 @@ def _ends(path: str) -> dict[int, int]:
 
 
 def loaded() -> dict[str, int]:
-    """Lines of weldcal's modules that are imported in this process, by module."""
+    """Lines of weldcal's modules that are imported in this process, by file."""
     found = {}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if name.split(".")[0] == "weldcal" and file and file.endswith(".py"):
-            found[name] = len(Path(file).read_text(encoding="utf-8").splitlines())
+            path = Path(file).resolve()
+            found[str(path)] = len(path.read_text(encoding="utf-8").splitlines())
     return found
 
 
@@ -86,8 +89,10 @@ def main() -> int:
     modules = loaded()
     print(f"loaded: {sum(modules.values())} lines in {len(modules)} modules")
     if entered.codes:
-        lines, places = entered.lines()
-        print(f"entered: {lines} lines in {places} modules")
+        lines = entered.lines()
+        print(f"entered: {sum(lines.values())} lines in {len(lines)} modules; loaded and not entered, the longest:")
+        idle = sorted((n, path) for path, n in modules.items() if path not in lines)
+        print(*(f"{n:6d} {Path(path).relative_to(ROOT)}" for n, path in idle[: -SHOWN - 1 : -1]), sep="\n")
     return finished.exit_code
 
 

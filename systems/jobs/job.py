@@ -122,7 +122,7 @@ def job_keys() -> tuple[str, ...]:
 def job_at(key: str) -> Job[Any]:
     """Return the job with a key of `job_keys`, or the one without a key for ""; imports its module."""
     added = added_jobs().get(key)
-    return importlib.import_module(f"weldcal.systems.jobs.{JOBS[key]}.job").JOB if added is None else added  # type: ignore[no-any-return]
+    return importlib.import_module(f"weldcal.systems.jobs.{JOBS[key]}.job").JOB if added is None else added
 
 
 def job_of(scenario: Scenario) -> Job[Any]:

@@ -22,6 +22,15 @@ from weldcal.systems.jobs.job import job_at, job_keys
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 
+REMOVED = {
+    "welding.law": "the guarded law is the only one",
+    **dict.fromkeys(
+        ("calibration.cost", "calibration.work_radius_mm", "calibration.cost_axes"),
+        "weldcal calibrate --compare runs Algorithm 1 on recorded scans",
+    ),
+}
+"""Keys of earlier versions, and what there is in their place."""
+
 
 def check_keys(schema: type, document: Any, place: str = "") -> None:
     """Check the keys of a parsed YAML document against a dataclass, in all its parts.
@@ -35,6 +44,8 @@ def check_keys(schema: type, document: Any, place: str = "") -> None:
     for key, value in document.items():
         if key == "_tag":
             continue
+        if why := REMOVED.get(f"{place}{key}"):
+            raise InputError(f"The key {place}{key} was removed: leave it out ({why}).")
         if key not in known:
             where = f" in {place.rstrip('.')}" if place else ""
             raise InputError(f"The key '{key}'{where} is not known{_suggestion(str(key), known)}.")

@@ -17,7 +17,6 @@ from weldcal.tools.farm.run import Farm
 GOOD = vars(
     CellRun(
         scenario="s_groove",
-        law="guarded",
         seed=0,
         completed=True,
         reason="",
@@ -52,7 +51,7 @@ def test_one_bad_run_misses_its_target(worse: dict[str, float], missed: list[str
 
 
 def test_runs_without_a_weld_miss_every_target() -> None:
-    broken = CellRun(scenario="s_groove", law="guarded", seed=0, completed=False, reason="held")
+    broken = CellRun(scenario="s_groove", seed=0, completed=False, reason="held")
     assert not any(target.met for target in targets([vars(broken)]).values())
 
 
@@ -61,7 +60,7 @@ def test_a_slow_computer_does_not_fail_the_study() -> None:
     assert not STUDY.measured({"off": {**GOOD, "torch_max_mm": 0.4}}).met
 
 
-@pytest.mark.parametrize("wrong", [{"scenarios": ("nowhere",)}, {"law": "magic"}])
+@pytest.mark.parametrize("wrong", [{"scenarios": ("nowhere",)}])
 def test_what_is_not_known_is_refused_before_any_work(wrong: dict[str, Any], tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with pytest.raises(WeldcalError):
@@ -72,7 +71,7 @@ def test_what_is_not_known_is_refused_before_any_work(wrong: dict[str, Any], tmp
 def test_the_table_has_every_run_and_grows_with_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "out"
 
-    def weld_once(name: str, seed: int, seam_mm: float | None, law: str) -> dict[str, Any]:
+    def weld_once(name: str, seed: int, seam_mm: float | None) -> dict[str, Any]:
         # the first line names the study
         assert len((folder / "tasks.jsonl").read_text().splitlines()) == 1 + seed
         return {**GOOD, "scenario": name, "seed": seed, "torch_max_mm": 0.1 * (seed + 1)}

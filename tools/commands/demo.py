@@ -4,29 +4,20 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol
-
-import typer
+from typing import Protocol
 
 from weldcal.systems.jobs.job import job_of
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import MOTION, Call, Outcome, ScenarioArgument, ScenarioOption, command, option
+from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.commands.weld import run_calibration_live, run_scenario
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions, run_document
 
 
-@command(
-    "calibrate-live", hidden=True, options=(*MOTION, "record"), short_help="Calibrate a scanner live in a scenario."
-)
-def calibrate_live(
-    call: Call,
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A scenario, by name or path.")],
-    robot: Annotated[str | None, option("--robot", "NAME", "simulated, emulated or a controller's address.")] = None,
-) -> Outcome:
+def calibrate_live(call: Call, scenario: str, robot: str | None) -> Outcome:
     """Calibrate a scanner live in a scenario, as `weldcal calibrate --scenario` does."""
     options = run_options(call, "calibrate", scenario, robot=robot)
     loaded = load_scenario(scenario)

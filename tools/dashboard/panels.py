@@ -26,7 +26,7 @@ _NEWEST_FRAMES = 200
 
 def stage_of(moment: Moment) -> str:
     """The key of the present step in the facts' steps: the command's phase, or what the state of another job says."""
-    state = moment.shown.get("state")
+    state: Any = moment.shown.get("state")
     if moment.command.finished:
         return moment.command.phase
     match type(state).__name__:  # by its name: the modules of the jobs that do not run are not imported
@@ -43,11 +43,12 @@ def stage_of(moment: Moment) -> str:
 
 def panel(facts: Facts, moment: Moment) -> dict[str, Any] | None:
     """Heading, note, plots and lines of a job besides the weld; None where it has nothing to show."""
-    state, drift = moment.shown.get("state"), moment.shown.get("drift")
+    state: Any = moment.shown.get("state")
     match type(state).__name__:
         case "MountingState" if (status := moment.shown.get("status")) is not None:
             return _mounting(facts, status)
         case "MotionState":
+            drift = moment.shown.get("drift")
             return _motion(facts, moment) if drift is None else _drift(drift)
         case "TabletState":
             return _tablet(facts, state)

@@ -213,7 +213,7 @@ class WeldJob(AddedJob):
         phase, order = command.phase, self.travel.order
         seams, seam = len(order), order.index(command.seam)
         share = SHARES.get(phase, 0.05)
-        if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
+        if phase in ("move_to_pose", "scan_pose"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
         welds, weld = seams * self.passes, seam * self.passes + command.weld_pass
@@ -257,7 +257,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         )
         calibrator = wiring.add(
             "iterative_calibrator",
-            IterativeCalibrator(station.arm, X_FR, standard, calibrator_config(scenario), station.background),
+            IterativeCalibrator(station.arm, X_FR, calibrator_config(scenario), station.background),
         )
         status = calibrator.GetOutputPort("calibration_status")
         chooser = wiring.add("calibration_pose_planner", CalibrationPosePlanner(plan))

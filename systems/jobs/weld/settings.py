@@ -51,7 +51,7 @@ from weldcal.welding.servo.weave import WEAVE_SHARE, Bound, WeaveConfig, check_w
 
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
-SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
+SPARE_POSES = 2  # to replace refused scans
 # a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind
 # the others
 NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
@@ -211,7 +211,6 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
-        law=welding.law,
         tacks=tacks,
         angles=angles,
         stitch=StitchConfig() if welding.stitch is None or pieces_of(welding).on_m else welding.stitch.stitch(),
@@ -398,9 +397,6 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         minimum_scans=c.minimum_scans,
         maximum_scans=c.maximum_scans,
         p_BWork=work_point(scenario),
-        cost=c.cost,
-        work_radius_m=c.work_radius_mm * 1e-3,
-        cost_axes=tuple(c.cost_axes),
         correct_scanner=c.correct_scanner,
         refine=c.refine,
     )

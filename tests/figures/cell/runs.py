@@ -25,7 +25,6 @@ from weldcal.tools.commands.weld import known_camera, measure, run_demo, run_sce
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.welding.servo.laws import get_law
 
 # (figure, name, worst or mean over the runs, limit, unit); a real-time factor is a lower bound and depends on the
 # machine
@@ -49,31 +48,25 @@ FIGURES = (
 )
 
 
-def cases(scenarios: Iterable[str], seeds: range, seam_mm: float | None = None, law: str = "guarded") -> Cases:
+def cases(scenarios: Iterable[str], seeds: range, seam_mm: float | None = None) -> Cases:
     """Return every scenario with every seed.
 
     Raises:
-        InputError: no such scenario or law.
+        InputError: no such scenario.
     """
-    get_law(law)
     unknown = [name for name in scenarios if name not in scenario_names() and not Path(name).is_file()]
     if unknown:
         raise InputError(f"There is no scenario '{unknown[0]}': choose some of {', '.join(scenario_names())}.")
-    return {
-        f"{name} {seed}": {"name": name, "seed": seed, "seam_mm": seam_mm, "law": law}
-        for name in scenarios
-        for seed in seeds
-    }
+    return {f"{name} {seed}": {"name": name, "seed": seed, "seam_mm": seam_mm} for name in scenarios for seed in seeds}
 
 
-def weld_once(name: str, seed: int, seam_mm: float | None, law: str) -> Mapping[str, object]:
+def weld_once(name: str, seed: int, seam_mm: float | None) -> Mapping[str, object]:
     """One weld of a scenario whose camera pose is known exactly, ``seam_mm`` of the seam (None: all of it)."""
     scenario: Scenario = known_camera(name)
     scenario.welding.seam_length_mm = seam_mm
-    scenario.welding.law = law
     run = run_cell(build_cell(scenario, seed))
     result = measure(run, RunOptions(scenario=name, out=Path(), seed=seed, recording=False))
-    return vars(figures(result, name, law, seed))
+    return vars(figures(result, name, seed))
 
 
 def targets(runs: Iterable[Mapping[str, Any]]) -> dict[str, Target]:
@@ -95,7 +88,6 @@ def _figures(results: Results) -> Figures:
     judged = targets(runs)
     return {
         "met": all(run["completed"] for run in runs) and all(t.met for t in judged.values() if t.decides),
-        "law": runs[0]["law"],
         "targets": {name: {"value": t.value, "limit": t.limit, "met": t.met} for name, t in judged.items()},
         "runs": runs,
     }
@@ -110,7 +102,7 @@ def _others(found: Figures) -> Iterable[Table]:
     broken = [(r["scenario"], str(r["seed"]), r["reason"]) for r in found["runs"] if not r["completed"]]
     header = ("", *(f"{run['scenario'].removesuffix('_groove')}\nseed {run['seed']}" for run in found["runs"]))
     lines = [(title, *(fixed(run[name], k) for run in found["runs"])) for title, name, k in FIGURES]
-    return (f"Law: {found['law']}", header, lines), ("Not completed", ("scenario", "seed", "reason"), broken)
+    return ("Welds", header, lines), ("Not completed", ("scenario", "seed", "reason"), broken)
 
 
 STUDY = Study(
@@ -134,12 +126,11 @@ def reproduce_cell(
     seam_mm: Annotated[
         float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
     ] = None,
-    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
 ) -> Outcome:
     """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
     names = [name.strip() for name in scenarios.split(",") if name.strip()]
     start = time.monotonic()
-    found = STUDY.outcome(call, cases(names, range(call.seed, call.seed + seeds), seam_mm, law))
+    found = STUDY.outcome(call, cases(names, range(call.seed, call.seed + seeds), seam_mm))
     more = {"wall_seconds": time.monotonic() - start, "written_to": call.written}
     return replace(found, summary={**found.summary, **more})
 
