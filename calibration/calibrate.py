@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -16,24 +16,19 @@ from weldcal.calibration.data.results import matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import InconsistentPoses, ScannerMoved
 from weldcal.calibration.eye_on_base.change_point import ChangePoint, find_change
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, corrected_observation
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, calibrate_from_few
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.tcp import TcpOffset, find_tcp
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.kinematics_choice import (
-    arm_document,
-    choose_kinematics,
-    kinematics_text,
-    with_kinematics,
-)
-from weldcal.calibration.refinement.local_field import LocalField, choose_local, with_field
-from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+
+if TYPE_CHECKING:
+    from weldcal.calibration.refinement.local_field import LocalField
+    from weldcal.models.arms.chain import Chain
 
 REFINEMENTS = ("local", "joints", "links")
 PLAIN = "none"
@@ -243,6 +238,8 @@ class Refined:
 
 def _refine_locally(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Refined:
     """Refine by a field of what the calibration leaves. Raises TooFewPoses below ten inliers."""
+    from weldcal.calibration.refinement.local_field import choose_local, with_field
+
     choice = choose_local(
         plain.inliers(observations),
         steps.patterns,
@@ -263,6 +260,13 @@ def _refine_locally(plain: Calibration, observations: Sequence[Observation], ste
 
 def _refine_arm(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Refined:
     """Refine by errors of the arm. Raises TooFewPoses and InputError as choose_kinematics does."""
+    from weldcal.calibration.refinement.kinematics_choice import (
+        arm_document,
+        choose_kinematics,
+        kinematics_text,
+        with_kinematics,
+    )
+
     if steps.arm is None or steps.joints is None:
         raise InputError(f"Errors of the arm (refine: {steps.refine}) need the arm and its joint angles at each scan.")
     q = steps.joints

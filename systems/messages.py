@@ -14,10 +14,9 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import Algorithm1State, Verification
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.welding.locate.part.joint import FitUp
+from weldcal.welding.locate.part.fit_up import FitUp
 from weldcal.welding.passes.angles import AnglesAlong
 from weldcal.welding.record.schedule import GapAlong
 from weldcal.welding.seam.curve import SeamCurve
@@ -190,10 +189,7 @@ class CalibrationStatus(Message):
     estimate: CalibrationEstimate | None = None
     # expected error of a point at the work point, from the estimate's own covariance and noise
     predicted_error_m: float = np.inf
-    verification_cloud: Verification | None = None  # P_v of Algorithm 1
-    algorithm_1: Algorithm1State | None = None
-    # scans, predicted error, held-out median, Algorithm 1's figure; m
-    history: tuple[tuple[int, float, float, float], ...] = ()
+    history: tuple[tuple[int, float, float], ...] = ()  # scans, predicted error, held-out median; m
     verifications: tuple[VerificationResult, ...] = ()
     done: bool = False
     message: str = ""

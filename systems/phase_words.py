@@ -3,8 +3,6 @@
 TEXT = {
     "start": "ready",
     "move_home": "to home",
-    "move_to_verification_cloud": "calibrate: to the verification pose",
-    "scan_verification_cloud": "calibrate: scan for verification",
     "move_to_pose": "calibrate: to the next pose",
     "scan_pose": "calibrate: scan",
     "move_to_verify": "verify: to a held-out pose",
@@ -50,11 +48,7 @@ OTHERS = {
 """The phases of the other jobs that the weld job does not have."""
 
 STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
-    (
-        "Calibrate",
-        "calibrate",
-        ("start", "move_home", "move_to_verification_cloud", "scan_verification_cloud", "move_to_pose", "scan_pose"),
-    ),
+    ("Calibrate", "calibrate", ("start", "move_home", "move_to_pose", "scan_pose")),
     ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
     ("Park", None, ("start", "move_home", "park")),
     ("Scan the part", "weld", ("move_to_scan", "scan_workpiece", "leave_scan")),

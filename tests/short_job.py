@@ -19,7 +19,6 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import RUNNERS
 from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
@@ -97,7 +96,7 @@ class ShortJobs:
 
         words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._folder), "--json"]
         with pytest.MonkeyPatch.context() as patched:
-            patched.setitem(RUNNERS, "", short)
+            patched.setattr("weldcal.tools.commands.demo.run_scenario", short)
             finished = CliRunner().invoke(app, words)
         lines = finished.stdout.splitlines()
         summary = json.loads(lines[-1]) if lines else {}

@@ -25,7 +25,7 @@ import numpy as np
 from tests.places import ROOT
 
 TICKS = 100
-LAWS, DRIVER = "welding/servo/laws.py", "systems/drivers/ur/rtde.py"
+LAWS, DRIVER = "welding/servo/track.py", "systems/drivers/ur/rtde.py"
 SCANS = 6
 
 

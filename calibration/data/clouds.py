@@ -19,8 +19,6 @@ from weldcal.calibration.data.cloud_files.depth import (
     is_depth_array,
     read_depth_image,
 )
-from weldcal.calibration.data.cloud_files.pcd import read_pcd
-from weldcal.calibration.data.cloud_files.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -309,11 +307,23 @@ def _surplus(path: Path, line: int, n: int, width: int) -> str:
     )
 
 
+def _read_ply(path: Path, form: CloudForm) -> Array:
+    from weldcal.calibration.data.cloud_files.ply import read_ply
+
+    return read_ply(path)
+
+
+def _read_pcd(path: Path, form: CloudForm) -> Array:
+    from weldcal.calibration.data.cloud_files.pcd import read_pcd
+
+    return read_pcd(path, form)
+
+
 _READERS: dict[str, Callable[[Path, CloudForm], Array]] = {
     ".npz": _read_npz,
     ".npy": _read_npy,
-    **dict.fromkeys((".ply", ".ply.gz"), lambda path, form: read_ply(path)),
-    **dict.fromkeys((".pcd", ".pcd.gz"), read_pcd),
+    **dict.fromkeys((".ply", ".ply.gz"), _read_ply),
+    **dict.fromkeys((".pcd", ".pcd.gz"), _read_pcd),
     **dict.fromkeys(IMAGES, read_depth_image),
     **dict.fromkeys((*_TEXT, *(f"{s}.gz" for s in _TEXT)), lambda path, form: read_text_cloud(path)),
 }

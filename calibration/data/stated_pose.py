@@ -14,8 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.lists import ARRAYS, TREES, lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import MOUNTINGS, last_key, mounting_name
+from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
+from weldcal.calibration.data.poses.names import ARRAYS, MOUNTINGS, TREES, last_key, mounting_name
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
@@ -95,3 +96,10 @@ def with_scanner(
 def few_residuals(redundancy: float) -> float:
     """Factor by which a 95 % region widens because its scale was estimated with that redundancy (F to chi-square)."""
     return 6.0 * f_quantile(0.95, 6, redundancy) / chi2_quantile(0.95, 6)
+
+
+def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
+    """Return an observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
+    return replace(
+        o, p_CR=correction.points(o.p_CR), n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C)
+    )

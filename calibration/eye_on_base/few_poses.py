@@ -8,8 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, expected_factors
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut
-from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, corrected_observation
 from weldcal.calibration.eye_on_base.solve import USUAL_SPREAD_M, USUAL_TILT_RAD, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern

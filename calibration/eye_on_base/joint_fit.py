@@ -7,8 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
-from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, corrected_observation, with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate, from_holes, from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors

@@ -19,7 +19,6 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.poses.bag import find_bag
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
 from weldcal.calibration.data.poses.source import find_poses
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
@@ -198,13 +197,6 @@ def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
         data.X_FR.GetAsMatrix4(),
     )
     return data if reading is None else data.read_as(reading, text)
-
-
-def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
-    """Return an observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
-    return replace(
-        o, p_CR=correction.points(o.p_CR), n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C)
-    )
 
 
 def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, seed: int, *, whole: bool) -> FlangeFit:

@@ -7,8 +7,12 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
-from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.estimate import (
+    CalibrationEstimate,
+    corrected_observation,
+    point_error_covariance,
+    sigma_at,
+)
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import t_quantile

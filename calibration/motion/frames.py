@@ -13,7 +13,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
-from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.face import IN_MOTION
+from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
 from weldcal.calibration.motion.start import search_in_hand, search_start
 from weldcal.calibration.motion.stream import ContinuousMotion
@@ -25,9 +26,6 @@ _MOST_TRIED = 48
 _AGAIN = 60  # fits after which the prediction is made anew
 _RADIUS = 0.85  # of the flange's diameter: about the predicted centre, some 15 mm wrong with a jitter of 15 ms
 _MOST_LOST = 12  # frames in a row that a whole search does not help either
-# 0.25 m/s over an exposure of 10 ms smears an edge by 2.5 mm, 0.7 mm rms, and pixel noise adds half a millimetre
-IN_MOTION = FlangeFitConfig(max_rim_rms_m=0.0012)
-"""How a frame taken in motion is fitted, live and in a recording."""
 # Edges of a rough face at a slant scatter by their share of its noise, beside the common error that the calibration
 # estimates.
 _ROUGH_M, _SLANT = 3e-4, 1.0

@@ -12,8 +12,8 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import ENDINGS, lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import natural, number_of
+from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
+from weldcal.calibration.data.poses.names import ENDINGS, natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.source import robot_list
 from weldcal.calibration.data.poses.trees import stacked

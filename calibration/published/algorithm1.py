@@ -1,6 +1,6 @@
 """Algorithm 1 of the flange paper: a pool of four pairs, improved by its verification figure, an ICP (Eq. 13)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -320,57 +320,6 @@ def sight(
 def translation_cost(error: Array) -> float:
     """Norm of the translation of the error (6,), m: the paper's default."""
     return float(np.linalg.norm(error[3:]))
-
-
-def translation_and_rotation_cost(work_radius_m: float) -> Cost:
-    """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m.
-
-    A bound on the error there, where the paper's is a norm of all six.
-    """
-
-    def cost(error: Array) -> float:
-        return float(np.linalg.norm(error[3:]) + work_radius_m * np.linalg.norm(error[:3]))
-
-    return cost
-
-
-def axes_cost(axes: tuple[int, ...], work_radius_m: float) -> Cost:
-    """Norm over chosen components of the error (0-2 rotation times ``work_radius_m``, 3-5 translation), m.
-
-    Section 4.2's choice of axes: (3, 4) is its pick-and-place example, with an end-effector that gives way along z.
-    """
-    if not axes or any(not 0 <= a < 6 for a in axes):
-        raise InputError("The axes of a cost are numbers from 0 to 5: 0-2 rotation, 3-5 translation.")
-
-    def cost(error: Array) -> float:
-        scaled = error * np.array([work_radius_m] * 3 + [1.0] * 3)
-        return float(np.linalg.norm(scaled[list(axes)]))
-
-    return cost
-
-
-COST_AXES = ("roll", "pitch", "yaw", "x", "y", "z")
-COSTS = ("translation", "translation_and_rotation", "work_radius")
-
-
-def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
-    """Return the cost a scenario asks for: the translation.
-
-    Section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius (``work_radius``); or a bound on the
-    error at that radius (``translation_and_rotation``). Raises InputError.
-    """
-    if name not in COSTS:
-        raise InputError(f"calibration.cost must be {', '.join(COSTS[:-1])} or {COSTS[-1]}, not '{name}'.")
-    if not work_radius_m >= 0.0:
-        raise InputError(f"calibration.work_radius_mm must not be negative, and it is {1e3 * work_radius_m:g}.")
-    unknown = [axis for axis in axes if axis not in COST_AXES]
-    if unknown or not axes:
-        raise InputError(
-            f"calibration.cost_axes must be some of {', '.join(COST_AXES)}, not {', '.join(unknown) or 'none'}."
-        )
-    if name == "work_radius":
-        return axes_cost(tuple(COST_AXES.index(axis) for axis in axes), work_radius_m)
-    return translation_cost if name == "translation" else translation_and_rotation_cost(work_radius_m)
 
 
 @dataclass(frozen=True, kw_only=True)

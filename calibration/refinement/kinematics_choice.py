@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from weldcal.calibration.data.dataset import Dataset, joint_angles
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError, TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, corrected_observation, with_scanner
 from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
@@ -38,6 +36,9 @@ from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+
+if TYPE_CHECKING:
+    from weldcal.calibration.data.dataset import Dataset
 
 _SAME_M, _SAME_RAD = (
     1e-4,
@@ -63,6 +64,8 @@ def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: 
     Raises DatasetError without angles, InputError where they lead elsewhere: to another arm, or to one whose controller
     has a factory calibration of its own.
     """
+    from weldcal.calibration.data.dataset import joint_angles  # the readers of files
+
     q = joint_angles(data, ids, arm.n)
     if q is None:
         raise DatasetError(

@@ -17,9 +17,8 @@ from scipy.optimize import minimize
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.stated_error import USUAL_FIELD_M, USUAL_TURN_RAD

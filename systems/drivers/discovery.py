@@ -1,19 +1,39 @@
-"""Finds drivers: modules of weldcal.systems.drivers, and modules that installed packages register as entry points."""
+"""Finds drivers: those of weldcal by their names, and modules that installed packages register as entry points."""
 
 import importlib
 import inspect
-import pkgutil
 from functools import cache
 from importlib.metadata import entry_points
-from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
 
-import weldcal.systems.drivers as drivers
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig, NoDevice
 
 ENTRY_POINTS = "weldcal.drivers"
+OWN = {
+    "FolderProfiler": "sensors.folder_profiler",
+    "FolderScanner": "sensors.folder_scanner",
+    "GenicamFingerCamera": "sensors.genicam.finger_camera",
+    "GenicamProfiler": "sensors.genicam.profiler",
+    "GenicamScanner": "sensors.genicam.scanner",
+    "ModbusPowerSource": "power.modbus",
+    "RealSense": "sensors.realsense",
+    "RenderedFingerCamera": "simulated.rendered_finger_camera",
+    "RenderedProfiler": "simulated.rendered_profiler",
+    "RenderedScanner": "simulated.rendered_scanner",
+    "RenderedWristCamera": "simulated.rendered_wrist_camera",
+    "SimulatedPowerSource": "simulated.power_source",
+    "SimulatedTablet": "simulated.tablet_world",
+    "SimulatedUr": "simulated.ur",
+    "StreamingScanner": "simulated.streaming_scanner",
+    "UrRtde": "ur.rtde",
+    "UrTouchProbe": "ur.touch_probe",
+    "VideoFingerCamera": "sensors.video_finger_camera",
+}
+"""The modules of weldcal's own drivers, below weldcal.systems.drivers, by the tag in a scenario."""
+DEFAULTS = frozenset({"RenderedFingerCamera", "RenderedScanner", "SimulatedUr"})
+"""Those with a DEFAULT_FOR, which every scenario may use without naming them."""
 
 
 @cache
@@ -37,14 +57,18 @@ def plugins() -> tuple[ModuleType, ...]:
 
 
 @cache
-def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
-    """Return the configuration classes of all drivers of a device, its default first.
+def driver_configs(device: str, tags: frozenset[str] | None = None) -> tuple[type[DriverConfig], ...]:
+    """Return the configuration classes of the drivers of a device, its default first.
+
+    Args:
+        device: one of DEVICES.
+        tags: the own drivers that are wanted besides the defaults, which saves the import of the others; None: all.
 
     Raises:
         InputError: two drivers have the same name.
     """
     found: dict[str, type[DriverConfig]] = {NoDevice.__name__: NoDevice}
-    for module in (*_own_modules(), *plugins()):
+    for module in (*_own_modules(tags), *plugins()):
         for config in _configs_of(module):
             if device not in config.FOR:
                 continue
@@ -59,18 +83,13 @@ def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
 
 def default_config(device: str) -> DriverConfig:
     """Return the default configuration of a device, used where a scenario does not name it."""
-    return driver_configs(device)[0]()
+    return driver_configs(device, frozenset())[0]()
 
 
-@cache
-def _own_modules() -> tuple[ModuleType, ...]:
-    """Return the modules of drivers/<backend>/ that define ApplyDriverConfig; helper modules are not imported."""
-    names = []
-    for finder, name, is_package in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + "."):
-        spec = None if is_package else finder.find_spec(name, None)
-        if spec is not None and spec.origin is not None and "\ndef ApplyDriverConfig(" in Path(spec.origin).read_text():
-            names.append(name)
-    return tuple(importlib.import_module(name) for name in sorted(names))
+def _own_modules(tags: frozenset[str] | None) -> tuple[ModuleType, ...]:
+    """Return the modules of own drivers, in the order of their names."""
+    wanted = sorted({module for tag, module in OWN.items() if tags is None or tag in tags | DEFAULTS})
+    return tuple(importlib.import_module(f"weldcal.systems.drivers.{module}") for module in wanted)
 
 
 def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:

@@ -1,7 +1,6 @@
-"""Job: the base class of jobs, and the search for those of weldcal and of installed packages."""
+"""Job: the base class of jobs, and those of weldcal and of installed packages by their keys."""
 
 import importlib
-import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
-import weldcal.systems.jobs as rooms
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -27,7 +25,16 @@ from weldcal.systems.wiring import Wiring
 
 PlanOf = TypeVar("PlanOf")
 Phases = Sequence[tuple[str, float, float]]
-MODULE = "job"  # jobs/<job>/job.py holds JOB
+JOBS = {
+    "": "weld",
+    "motion": "motion",
+    "mounting": "mounting",
+    "profiler_job": "profiler",
+    "tablet": "tablet",
+    "tool_scan": "tool_scan",
+    "touch": "touch",
+}
+"""The folders of weldcal's own jobs by the key of their part of a scenario; jobs/<folder>/job.py holds JOB."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -78,9 +85,8 @@ class Job(ABC, Generic[PlanOf]):
     move_speed = MOVE_SPEED  # rad/s of the fastest joint
     move_acceleration = MOVE_ACCELERATION  # rad/s^2
 
-    @abstractmethod
     def check(self, scenario: Scenario) -> None:
-        """Check this job's part of a scenario, present or not; raises InputError."""
+        """Check this job's part of a scenario, which has one; raises InputError."""
 
     def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
@@ -102,12 +108,21 @@ class Job(ABC, Generic[PlanOf]):
 
 
 @cache
-def jobs() -> tuple[Job[Any], ...]:
-    """Return all jobs, sorted by key; the job without a key is the last."""
-    names = [info.name for info in pkgutil.iter_modules(rooms.__path__, rooms.__name__ + ".") if info.ispkg]
-    modules = [importlib.import_module(f"{name}.{MODULE}") for name in names]
-    found = [module.JOB for module in (*modules, *plugins()) if hasattr(module, "JOB")]
-    return tuple(sorted(found, key=lambda job: (not job.key, job.key)))
+def added_jobs() -> dict[str, Job[Any]]:
+    """Return the jobs of installed packages by their keys."""
+    found = [module.JOB for module in plugins() if hasattr(module, "JOB")]
+    return {job.key: job for job in found if job.key}
+
+
+def job_keys() -> tuple[str, ...]:
+    """Return the keys of all jobs that a scenario may have, sorted; no module of a job is imported."""
+    return tuple(sorted({*JOBS, *added_jobs()} - {""}))
+
+
+def job_at(key: str) -> Job[Any]:
+    """Return the job with a key of `job_keys`, or the one without a key for ""; imports its module."""
+    added = added_jobs().get(key)
+    return importlib.import_module(f"weldcal.systems.jobs.{JOBS[key]}.job").JOB if added is None else added
 
 
 def job_of(scenario: Scenario) -> Job[Any]:
@@ -116,8 +131,7 @@ def job_of(scenario: Scenario) -> Job[Any]:
     Raises:
         InputError: the scenario has the parts of two jobs.
     """
-    asked = [job for job in jobs() if job.key and getattr(scenario, job.key, None) is not None]
+    asked = [key for key in job_keys() if getattr(scenario, key, None) is not None]
     if len(asked) > 1:
-        keys = " or ".join(job.key for job in asked)
-        raise InputError(f"A scenario has one job: move {keys} to another scenario.")
-    return asked[0] if asked else jobs()[-1]
+        raise InputError(f"A scenario has one job: move {' or '.join(asked)} to another scenario.")
+    return job_at(asked[0] if asked else "")

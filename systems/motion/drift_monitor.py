@@ -17,8 +17,7 @@ from weldcal.calibration.data.scanner_correction import (
     correction_from_document,
 )
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
-from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
-from weldcal.calibration.motion.drift.watch import drift_config
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest, drift_config
 from weldcal.models.arms.chain import chain_of, chain_poses
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array

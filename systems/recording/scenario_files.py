@@ -9,12 +9,10 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, Final
 
-from pydrake.common.yaml import yaml_dump_typed
-
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import is_scanner_file
 from weldcal.models.workpieces.step import referenced
-from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.loading import load_scenario, scenario_text
 from weldcal.systems.scenario.schema import Scenario
 
 SCENARIO: Final = "scenario.yaml"
@@ -31,7 +29,7 @@ def packed(scenario: Scenario) -> dict[str, bytes]:
         files[name] = path.read_bytes()
         files |= {other.name: other.read_bytes() for other in referenced(path)}
         setattr(config, field, name)
-    return {SCENARIO: yaml_dump_typed(copy).encode(), **files}
+    return {SCENARIO: scenario_text(copy).encode(), **files}
 
 
 def unpacked(files: Mapping[str, bytes], folder: Path) -> Scenario:

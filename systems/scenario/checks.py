@@ -8,7 +8,6 @@ from typing import Any, get_args, get_origin
 import numpy as np
 
 from weldcal.calibration.calibrate import LIVE_KINDS, PLAIN
-from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.calibration.refinement.kinematics_choice import LEAST as LEAST_OF_ARM
 from weldcal.calibration.refinement.local_field import LEAST as LEAST_OF_FIELD
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -16,12 +15,12 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.models.workpieces.reading import LARGEST_SIZE_M
 from weldcal.systems.drivers.config import NoDevice, check_range
-from weldcal.systems.jobs.job import job_of, jobs
+from weldcal.systems.jobs.job import job_of
+from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
-from weldcal.welding.locate.part.joint import SHOWN_BY
+from weldcal.welding.locate.part.fit_up import SHOWN_BY
 from weldcal.welding.record.schedule import VALUES
-from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
     *("required_error_mm", "theta_max_deg", "guess_radius_mm", "verification_limit_mm", "clearance_m", "clearance_mm"),
@@ -45,7 +44,7 @@ POSITIVE = {
 }
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
-    *("repeatability_mm", "from_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
+    *("repeatability_mm", "from_mm", "kinematic_error_mm", "warp_mm"),
     *("interpass_s", "translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg", "margin_m"),
 }
@@ -310,8 +309,8 @@ def check_tack_order(scenario: Scenario) -> None:
             )
         if not 1 <= tack.seam <= seams:
             raise InputError(f"welding.tacks[{k}].seam is {tack.seam}, and the part has seams 1 to {seams}.")
-    if welding.tacks and (welding.pass_obstacles or welding.law != "guarded"):
-        raise InputError("welding.tacks goes with welding.law: guarded and without welding.pass_obstacles.")
+    if welding.tacks and welding.pass_obstacles:
+        raise InputError("welding.tacks goes without welding.pass_obstacles; leave out one of them.")
 
 
 def check_seam_order(scenario: Scenario) -> None:
@@ -345,10 +344,63 @@ def check_angles_order(scenario: Scenario) -> None:
             order.ends_rad(name)
         if order.stick_out_mm is not None:
             check_range("angles.stick_out_mm", order.stick_out_mm, 3.0, 40.0)  # a choice: of any arc with a wire
-        if welding.law != "guarded" or welding.lean_deg:
-            raise InputError(
-                "Ordered angles go with welding.law: guarded and welding.lean_deg: 0; leave out the other."
-            )
+        if welding.lean_deg:
+            raise InputError("Ordered angles go with welding.lean_deg: 0; leave out the other.")
+
+
+def check_devices(scenario: Scenario, key: str) -> None:
+    """Check that scanner, second robot, tool and profiler belong to the job with this key.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    scanner = scenario.scanner_config()
+    if key in ("mounting", "profiler_job", "tablet") and scanner is not None and scanner.stream_delay_s() is not None:
+        raise InputError(
+            "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job: write"
+            " motion: {} or another scanner."
+        )
+    check_mounting(
+        scenario.calibration.configuration,
+        scenario.part(MountingJob),
+        "base" if scanner is None else scanner.mounted_on,
+        second_robot=not isinstance(scenario.robot_2, NoDevice),
+        weld=scenario.job.weld,
+    )
+    if key != "profiler_job" and not isinstance(scenario.profiler, NoDevice):
+        raise InputError("A profiler needs a job: write profiler_job: {} in the scenario.")
+    if key != "tablet" and scenario.tool == "pen":
+        raise InputError("A pen touches a tablet: write tablet: {} in the scenario, or another tool.")
+
+
+def check_scan_poses(scenario: Scenario) -> None:
+    """Check the scan poses of the workpiece, and that the pose of a scanner on the flange is known.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    job, poses, scanner = scenario.job, scenario.planning.scan_poses_deg, scenario.scanner_config()
+    on_flange = scanner is not None and scanner.mounted_on == "flange"
+    if poses and not on_flange:
+        raise InputError(
+            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the"
+            " arm has one view: remove the list, or let the arm carry the scanner."
+        )
+    if on_flange and job.weld and (job.calibrate or job.X_FC is None):
+        nominal = scenario.calibration.mounting_guess
+        raise InputError(
+            "A weld with the scanner on the flange needs its pose there. Calibrate with the scenario eye_in_hand first."
+            f" Then write, with its numbers: job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
+            f" {nominal.rpy_deg}}}}}"
+        )
+    if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
+        raise InputError(
+            "planning.scan_poses_deg: several poses are for a part from a file; write one pose for a plate."
+        )
+    for k, pose in enumerate(poses):
+        if len(pose) != 6:
+            raise InputError(f"planning.scan_poses_deg[{k}] must hold 6 angles, not {len(pose)}.")
+        check_home(pose, scenario.arm, f"planning.scan_poses_deg[{k}]")
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -369,8 +421,9 @@ def check_scenario(scenario: Scenario) -> None:
             f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or"
             " calibrate with the default job (job.weld: false)."
         )
-    for job in jobs():
-        job.check(scenario)
+    check_devices(scenario, found.key)
+    check_scan_poses(scenario)
+    found.check(scenario)
     if not found.key and not scenario.job.calibrate and not scenario.job.weld:
         raise InputError("This scenario has nothing to do: set job.calibrate or job.weld to true.")
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
@@ -378,11 +431,10 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     check_order(scenario)
+    if scenario.welding.weave is not None:
+        scenario.welding.weave.weave()
     scenario.welding.arc.check(scenario.reports_arc)
     check_schedule(scenario)
-    weave = scenario.welding.weave
-    if weave is not None and weave.weave().amplitude_m and scenario.welding.law != "guarded":
-        raise InputError("welding.weave goes with welding.law: guarded only; leave out one of them.")
     if scenario.welding.later_passes() and scenario.welding.pass_obstacles:
         raise InputError("welding.passes goes without welding.pass_obstacles; leave out one of them.")
     check_tack_order(scenario)
@@ -395,7 +447,6 @@ def check_scenario(scenario: Scenario) -> None:
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
-    named_cost(calibration.cost, 1e-3 * calibration.work_radius_mm, calibration.cost_axes)
     if isinstance(scenario.tool, str) and scenario.tool not in ("welding", "pen", "none"):
         raise InputError(f"tool must be welding, pen, none or {{file: my_tool.yaml}}, not '{scenario.tool}'.")
     loaded = scenario.loaded_tool()
@@ -411,7 +462,6 @@ def check_scenario(scenario: Scenario) -> None:
         scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
-    get_law(scenario.welding.law)
     if not 0.0 <= scenario.welding.lean_deg <= 10.0:
         raise InputError(f"welding.lean_deg must be from 0 to 10, not {scenario.welding.lean_deg:g}.")
     if scenario.welding.posture not in ("home", "any"):

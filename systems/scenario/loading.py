@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import re
+from collections.abc import Iterable, Iterator
 from datetime import date
 from functools import cache, partial, reduce
 from operator import or_
@@ -9,17 +10,26 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
-from pydrake.common.yaml import yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
 from weldcal.models.documents import did_you_mean, nearest, parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 from weldcal.models.scanners import get_scanner, is_scanner_file
-from weldcal.systems.drivers.config import DEVICES
-from weldcal.systems.drivers.discovery import default_config, driver_configs
-from weldcal.systems.jobs.job import jobs
+from weldcal.systems.drivers.config import DEVICES, NoDevice
+from weldcal.systems.drivers.discovery import OWN, default_config, driver_configs
+from weldcal.systems.jobs.job import job_at, job_keys
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
+
+REMOVED = {
+    "welding.law": "the guarded law is the only one",
+    **dict.fromkeys(
+        ("calibration.cost", "calibration.work_radius_mm", "calibration.cost_axes"),
+        "weldcal calibrate --compare runs Algorithm 1 on recorded scans",
+    ),
+}
+"""Keys of earlier versions, and what there is in their place."""
 
 
 def check_keys(schema: type, document: Any, place: str = "") -> None:
@@ -34,6 +44,8 @@ def check_keys(schema: type, document: Any, place: str = "") -> None:
     for key, value in document.items():
         if key == "_tag":
             continue
+        if why := REMOVED.get(f"{place}{key}"):
+            raise InputError(f"The key {place}{key} was removed: leave it out ({why}).")
         if key not in known:
             where = f" in {place.rstrip('.')}" if place else ""
             raise InputError(f"The key '{key}'{where} is not known{_suggestion(str(key), known)}.")
@@ -77,18 +89,42 @@ def scenario_names() -> list[str]:
 
 
 @cache
-def scenario_class() -> type[Scenario]:
-    """The schema with a union of all installed drivers for each device, and an optional key for each job.
+def scenario_class(keys: frozenset[str] | None = None, tags: frozenset[str] | None = None) -> type[Scenario]:
+    """The schema with a union of the installed drivers for each device, and an optional key for each job.
+
+    Args:
+        keys: the jobs that are wanted; the others' keys hold None only, and their modules are not imported. None: all.
+        tags: see driver_configs.
 
     Raises:
         InputError: an installed driver cannot be used.
     """
     fields: list[tuple[str, Any, Any]] = []
     for device in DEVICES:
-        union = reduce(or_, driver_configs(device))
+        union = reduce(or_, driver_configs(device, tags))
         fields.append((device, union, dc.field(default_factory=partial(default_config, device))))
-    fields += [(job.key, job.config | None, None) for job in jobs() if job.key and job.config is not None]
+    for key in job_keys():
+        config = str if keys is not None and key not in keys else job_at(key).config
+        if config is not None:
+            fields.append((key, config | None, None))
     return dc.make_dataclass("Scenario", fields, bases=(Scenario,))
+
+
+def _class_with(keys: Iterable[str], tags: Iterable[str]) -> type[Scenario]:
+    """The schema with these jobs and drivers; with all drivers where one is of another package, or unknown."""
+    named = frozenset(tags) - {NoDevice.__name__}
+    return scenario_class(frozenset(keys) & {*job_keys()}, named if named <= OWN.keys() else None)
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """Return the YAML text of a scenario, which may have another driver than the file that it was loaded from.
+
+    Raises:
+        RuntimeError: a driver was made in Python, and no file can name it.
+    """
+    keys = [key for key in job_keys() if getattr(scenario, key, None) is not None]
+    schema = _class_with(keys, [type(getattr(scenario, device)).__name__ for device in DEVICES])
+    return str(yaml_dump_typed(scenario, schema=schema))
 
 
 def use_nominal_scanner(scenario: Scenario) -> None:
@@ -106,10 +142,15 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
     Raises:
         InputError: unknown name, unknown key, wrong type; the message says which.
     """
-    scenario = _read(name, ())
+    parts = [*_chain(name, ())]
     if overrides.strip():
-        scenario = _merged(scenario, "the overrides", overrides)
-        resolve_files(scenario, _path_of(name).parent)
+        parts.append(("the overrides", overrides, _path_of(name).parent))
+    keys = (parse_document(label, text) for label, text, _ in parts if text.strip())
+    named = {str(key) for document in keys if isinstance(document, dict) for key in document}
+    scenario = _class_with(named, (tag for _, text, _ in parts for tag in re.findall(r"!(\w+)", text)))()
+    for label, text, folder in parts:
+        scenario = _merged(scenario, label, text)
+        resolve_files(scenario, folder)
     _use_width_of_scanner_file(scenario)
     _use_camera_of(scenario)
     if (job := scenario.job).weld and not (job.calibrate or job.X_BC or job.X_FC):
@@ -122,8 +163,8 @@ def _path_of(name: str) -> Path:
     return Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
 
 
-def _read(name: str, before: tuple[Path, ...]) -> Scenario:
-    """The scenario of a file over the one that it extends; `before` are the files that have led to it."""
+def _chain(name: str, before: tuple[Path, ...]) -> Iterator[tuple[str, str, Path]]:
+    """Names, texts and folders of a scenario's files, each after the one that it extends; `before` have led here."""
     path = _path_of(name)
     if not path.exists():
         asked = (
@@ -137,29 +178,30 @@ def _read(name: str, before: tuple[Path, ...]) -> Scenario:
     text = read_text(path, LARGEST_DOCUMENT)
     document = parse_document(path.name, text) if text.strip() else None  # within bounds, no key twice
     base = document.get("extends") if isinstance(document, dict) else None
-    scenario = scenario_class()()
     if base:
         beside = path.parent / str(base)
-        scenario = _read(str(beside) if beside.suffix and beside.exists() else str(base), (*before, path.resolve()))
-    merged = _merged(scenario, path.name, text)
-    resolve_files(merged, path.parent)
-    return merged
+        yield from _chain(str(beside) if beside.suffix and beside.exists() else str(base), (*before, path.resolve()))
+    yield path.name, text, path.parent
 
 
 def _merged(scenario: Scenario, label: str, text: str) -> Scenario:
     """A scenario with the keys of a YAML text in place of its own."""
     if not text.strip():
         return scenario
-    parse_document(label, text)
-    schema = scenario_class()
+    schema = type(scenario)
     try:
-        check_keys(schema, yaml_load(data=text))
+        document = yaml_load(data=text)
+        try:
+            check_keys(schema, document)
+        except InputError:
+            check_keys(scenario_class(), document)  # whose message lists every key and driver
+            raise
         merged: Scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
     except InputError as error:
         raise InputError(f"Scenario {label}: {str(error)[0].lower()}{str(error)[1:]}") from error
     except Exception as error:  # Drake's loader raises several types, and not every message names the key
         what = " ".join(str(error).split())
-        raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+        raise InputError(f"Scenario {label} cannot be read{_part_at_fault(schema, text)}: {what}") from error
     return merged
 
 
@@ -200,12 +242,11 @@ def _use_camera_of(scenario: Scenario) -> None:
         own["calibration"] = loaded.calibration
 
 
-def _part_at_fault(text: str) -> str:
+def _part_at_fault(schema: type[Scenario], text: str) -> str:
     """The top-level part of a YAML text that does not load by itself, as a phrase for a message.
 
     Empty where not found.
     """
-    schema = scenario_class()
     parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
     for part in filter(str.strip, parts):
         try:

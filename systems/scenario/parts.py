@@ -13,7 +13,6 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm, mounted, with_lin
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.workpieces.drawing import resampled
-from weldcal.models.workpieces.mesh_files import read_surface
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.reading import MESH_SUFFIXES, read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, seam_of
@@ -71,6 +70,8 @@ def _obstacle(k: int, config: ObstacleConfig) -> Obstacle:
 def _mesh(path: Path, unit: str) -> TriMesh:
     """The surface of a file; a mesh may be open."""
     if path.suffix.lower() in MESH_SUFFIXES and unit in UNITS_M:
+        from weldcal.models.workpieces.mesh_files import read_surface
+
         return read_surface(path, UNITS_M[unit])
     return read_shape(path, unit).mesh
 

@@ -8,7 +8,6 @@ from typing import TypeVar
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.published.algorithm1 import COST_AXES
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import get_robot
@@ -76,9 +75,6 @@ class CalibrationConfig:
     refine: str = "none"
     verification_scans: int = 1
     verification_limit_mm: float = 0.5  # a larger error at a held-out pose holds the job
-    cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
-    work_radius_mm: float = 200.0  # section 4.2: distance from the flange centre at which a rotation is weighted
-    cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: the weighted axes
     table_z_m: float = 0.0  # height of the table in the world W, whose origin is the base where `base` is not given
     clearance_m: float = 0.05
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
@@ -323,9 +319,6 @@ class WeldingConfig:
     pass_obstacles: bool = False
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
-    # steering law: guarded; of the paper, for comparison: printed, literal (sign corrected), open (fitted normal, no
-    # feedback), fixed (with feedback), fixed_zeroed, dls (damped division); see welding/servo/laws.py
-    law: str = "guarded"
 
     def tacks_m(self) -> list[tuple[int, float, float, float]]:
         """The tacks: number of the seam, from 0, start and end along it, and height over its root, m."""

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.calibration.flange.test_base_circle import scan
-from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.flanges import get_flange

@@ -11,8 +11,8 @@ import pytest
 from tests.figures.flange.recorded import usable_scans
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors
 from weldcal.models.errors import InputError

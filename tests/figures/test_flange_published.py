@@ -34,8 +34,9 @@ from tests.figures.flange.published.simulation import (
 )
 from tests.figures.harness import Run
 from tests.places import SHARED_DATA, needs
-from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import fit_rigid
 from weldcal.calibration.published.algorithm1 import COMPONENTS, VerificationError, algorithm1_start, algorithm1_step

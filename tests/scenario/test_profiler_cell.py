@@ -24,7 +24,7 @@ from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import RUNNERS, kind_of
+from weldcal.tools.commands.demo import kind_of, runner_of
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.report.profiler_live import ProfilerLive
 from weldcal.tools.report.run import RunOptions
@@ -41,7 +41,7 @@ profiler_job:
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> ProfilerLive:
     scenario = load_scenario("profiler_seam", SHORT)
-    assert RUNNERS[kind_of(scenario)] is run_profiler_live
+    assert runner_of(kind_of(scenario)) is run_profiler_live
     options = RunOptions(scenario="profiler_seam", out=tmp_path_factory.mktemp("live"), seed=2, recording=False)
     return run_profiler_live(scenario, options, lambda *_: None)
 

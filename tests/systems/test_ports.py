@@ -200,7 +200,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     MotionRecorder: lambda: MotionRecorder(Path("unused")),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
-    IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
+    IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, CALIBRATOR),
     CalibrationPosePlanner: lambda: CalibrationPosePlanner(()),
     SeamPlanner: lambda: SeamPlanner(seam_planning()),
     DrawnSeamPlanner: lambda: DrawnSeamPlanner(seam_planning()),

@@ -202,9 +202,6 @@ calibration:
   maximum_scans: 9
   verification_scans: 2
   verification_limit_mm: 0.4
-  cost: work_radius
-  work_radius_mm: 300.0
-  cost_axes: [x, y]
   table_z_m: -0.01
   clearance_m: 0.04
   work_point_m: [0.5, 0.1, 0.0]
@@ -256,7 +253,6 @@ welding:
   tacks: [{from_mm: 50.0, to_mm: 60.0, height_mm: 5.0, seam: 2}]
   passes: [{lateral_mm: 1.0, vertical_mm: 3.0, angle_deg: 5.0, travel_angle_deg: 6.0, speed_mm_s: 9.0,
             reverse: true, interpass_s: 30.0}]
-  law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4
   pass_obstacles: true
@@ -378,7 +374,7 @@ def test_one_word_changes_the_robot_and_none_of_its_options_is_lost() -> None:
     assert compare(UrRtde, text, loaded.robot, UrRtde()) == []
     shipped = load_scenario("s_groove")
     loaded.robot = shipped.robot
-    assert loaded == shipped
+    assert vars(loaded) == vars(shipped)
 
 
 def test_a_device_can_be_said_to_be_absent() -> None:
@@ -469,9 +465,6 @@ def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str
         ("job: {maximum_time_s: 0}", "job.maximum_time_s"),
         ("home_deg: [0.0, 1.0]", "home_deg"),
         ("calibration: {feature: elbow}", "calibration.feature.*'elbow'"),
-        ("calibration: {cost: money}", "calibration.cost.*'money'"),
-        ("calibration: {cost_axes: [x, w]}", "calibration.cost_axes must be some of roll, .* not w"),
-        ("calibration: {work_radius_mm: -1.0}", "calibration.work_radius_mm must not be negative"),
         ("tool: gripper", "tool must be.*'gripper'"),
         ("calibration: {minimum_scans: 3}", "calibration.minimum_scans must be at least 4"),
     ],
@@ -580,7 +573,8 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("welding: {law: magic}", "magic"),
+        ("welding: {law: guarded}", "key welding.law was removed: leave it out"),
+        ("calibration: {cost: money}", "key calibration.cost was removed: .*--compare"),
         ("workpiece: {located_by: luck}", "scan or drawing"),
         ("workpiece: {bend_radius_mm: -1.0, located_by: drawing}", "bend_radius_mm must be a positive number"),
     ],

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from weldcal.tools import commands
 from weldcal.tools.cli.app import GROUPS, PANELS, build_app
-from weldcal.tools.cli.discovery import ON_DEMAND, find_commands, on_demand, other_command
+from weldcal.tools.cli.discovery import find_commands
 
 MODULE = '''"""A command of a test."""
 
@@ -99,14 +99,3 @@ def test_every_command_has_one_whole_line_of_help(group: str) -> None:
     for help in rows.values():
         assert help.endswith(".")
         assert not help.endswith(("...", "Fig.", "Eq."))
-
-
-def test_another_command_is_found_by_its_name() -> None:
-    assert other_command("view").title == "view"
-    with pytest.raises(KeyError):
-        other_command("dance")
-
-
-@pytest.mark.parametrize("name", ON_DEMAND)
-def test_a_function_on_demand_is_found_by_its_name(name: str) -> None:
-    assert on_demand(name).__name__ == name

@@ -13,9 +13,8 @@ from tests.worlds.cell import HOME, Bend, bend, distorted, factory_errors, scann
 from tests.worlds.flange_frames import facing
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors

@@ -7,22 +7,14 @@ A module is imported when its command is called. Until then only the text of its
 import ast
 import importlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 from weldcal.tools.cli.options import CliCommand
 
 PACKAGES = ("weldcal.tools.commands", "weldcal.tools.cli")
 """Packages whose modules, at any depth, hold the commands of weldcal."""
-
-ON_DEMAND = {
-    "compare_algorithm1": "weldcal.tools.commands.algorithm1_comparison",
-    "name_cause": "weldcal.tools.report.doctor",
-}
-"""Functions that few calls of a command need, such as for one option, and their modules."""
 
 DECORATOR = re.compile(r"^@command(\([^@]*?\))\n(?:@one_of\([^@]*?\)\n)?def ", re.MULTILINE | re.DOTALL)
 
@@ -69,23 +61,3 @@ def _entries(text: str, module: str) -> Iterator[Entry]:
         given = {word.arg: word.value for word in call.keywords}
         hidden = "hidden" in given and bool(ast.literal_eval(given["hidden"]))
         yield Entry(ast.literal_eval(call.args[0]), ast.literal_eval(given["short_help"]), hidden, module)
-
-
-@cache
-def _known() -> dict[str, Entry]:
-    return find_commands()
-
-
-def other_command(title: str) -> CliCommand:
-    """Find a command by its full name, for a command that hands its work on; imports its module.
-
-    Raises:
-        KeyError: there is no such command.
-    """
-    return _known()[title].load()
-
-
-def on_demand(name: str) -> Callable[..., Any]:
-    """Find a function of ON_DEMAND; imports its module."""
-    function: Callable[..., Any] = getattr(importlib.import_module(ON_DEMAND[name]), name)
-    return function

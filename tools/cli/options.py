@@ -207,12 +207,7 @@ class Call:
 
 @dataclass(frozen=True)
 class CliCommand:
-    """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body.
-
-    Attributes:
-        body: the work as it is written, body(call, own parameters ...) -> Outcome, for a command that hands its work
-            on.
-    """
+    """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body as it is written."""
 
     title: str
     function: Callable[..., None]

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -20,7 +20,6 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, IcpRecord, export_all, save_result, software_version
 from weldcal.calibration.doctor.case import FEWEST, dataset_case, write_case
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
@@ -31,13 +30,11 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold, samp
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.kinematics_choice import require_joint_angles
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.tools.cli.discovery import on_demand, other_command
 from weldcal.tools.cli.options import (
     MOTION,
     Call,
@@ -59,6 +56,9 @@ from weldcal.tools.report.calibration import (
 )
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import csv_text, statistics, write_atomic
+
+if TYPE_CHECKING:
+    from weldcal.calibration.eye_on_base.arm_start import ArmStart
 
 _CONFIRMING = 3  # hole circles without which the robot's motion alone does not change the scanner
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
@@ -132,7 +132,9 @@ def calibrate(
             )
         if limit_mm is not None:
             raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")
-        return other_command("calibrate-live").body(call, scenario, robot=robot)
+        from weldcal.tools.commands.demo import calibrate_live
+
+        return calibrate_live(call, scenario, robot)
     assert dataset is not None
     if is_motion(dataset):
         if poses is not None or axis_turn is not None or refine is not None or compare:
@@ -140,16 +142,18 @@ def calibrate(
                 "--poses, --refine, --axis-turn and --compare are for scans at rest; omit them with a recording in"
                 " motion"
             )
-        moving = other_command("calibrate-motion").body
-        return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
+        from weldcal.tools.commands.calibrate_motion import calibrate_recording
+
+        return calibrate_recording(call, dataset, robot, flange, centres=centres, limit_mm=limit_mm)
     if is_carried(dataset):
         if axis_turn is not None or refine is not None or compare or centres or not scanner_correction:
             raise typer.BadParameter(
                 "--refine, --axis-turn, --compare, --centres and --no-scanner-correction are for a scanner beside the"
                 " robot; omit them"
             )
-        carried = other_command("calibrate-carried").body
-        return carried(call, dataset, robot=robot, flange=flange, poses=poses, limit_mm=limit_mm)
+        from weldcal.tools.commands.mounting_live import calibrate_recorded
+
+        return calibrate_recorded(call, dataset, robot, flange, poses=poses, limit_mm=limit_mm)
     report = calibrate_dataset(
         dataset,
         call.folder("calibrate", dataset.resolve().name),
@@ -225,6 +229,8 @@ def calibrate_dataset(
     start: ArmStart | None = None
     if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
         tell("comparing the visible arm", 0.7)
+        from weldcal.calibration.eye_on_base.arm_start import see_with_arm
+
         seen, start = see_with_arm(data, seen, standard, robot or data.header.robot, seed=seed)
     data = seen.data or data
     observations, fits, refused = list(seen.observations), seen.fits, list(seen.refused)
@@ -270,7 +276,9 @@ def calibrate_dataset(
     icp: tuple[IcpRecord, ...] = ()
     if compare:
         tell("Algorithm 1 for comparison", 0.8)
-        algorithm1, icp = on_demand("compare_algorithm1")(seen, inliers, curve.counts, standard, seed)
+        from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+
+        algorithm1, icp = compare_algorithm1(seen, inliers, curve.counts, standard, seed)
     warnings = [*found.warnings, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
@@ -397,7 +405,9 @@ def _examined_where_refused(
         if len(seen.observations) >= FEWEST:
             case = dataset_case(data, seen, standard, standard)
             write_case(out, case)
-            on_demand("name_cause")(problem, case)
+            from weldcal.tools.report.doctor import name_cause
+
+            name_cause(problem, case)
         raise
 
 
@@ -415,6 +425,8 @@ def _refinement(
     arm = load_chain(robot, kinematics)
     ids = [o.id for o in observations]
     poses = {p.id: p.X_BR for p in data.pairs} or data.poses
+    from weldcal.calibration.refinement.kinematics_choice import require_joint_angles
+
     q = require_joint_angles(data, ids, arm, np.array([poses[id].GetAsMatrix4() for id in ids]))
     note = f"{robot}, refined by weldcal calibrate --refine {kind}"
     return replace(steps, refine=kind, arm=arm, joints=q, note=note)
@@ -444,7 +456,7 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
     return []
 
 
-def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
+def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: "ArmStart | None") -> None:
     """Require one usable scan.
 
     Where others were refused: four (then more can be taken), or two that the visible arm confirms.

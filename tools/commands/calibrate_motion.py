@@ -3,10 +3,8 @@
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
@@ -19,7 +17,7 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import stated_flange
-from weldcal.tools.cli.options import Call, FlangeOption, LimitOption, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report, motion_result
@@ -29,14 +27,8 @@ _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibr
 _MOST_TURNED = 50  # poses whose orientations are compared
 
 
-@command("calibrate-motion", hidden=True, short_help="Calibrate a scanner from a recording in motion.")
 def calibrate_recording(
-    call: Call,
-    dataset: Annotated[Path, typer.Argument(help="A recording in motion: dataset.yaml, stream.csv, clouds.")],
-    robot: Annotated[str | None, option("--robot", "NAME", "The arm, if dataset.yaml does not name it.")] = None,
-    flange: FlangeOption = None,
-    centres: Annotated[bool, switch("--centres", "Also write centres.csv: the flange centre in each frame.")] = False,
-    limit_mm: LimitOption = None,
+    call: Call, dataset: Path, robot: str | None, flange: str | None, *, centres: bool, limit_mm: float | None
 ) -> Outcome:
     """Calibrate a scanner from a recording in motion, as `weldcal calibrate` does for such a folder."""
     report = calibrate_motion(

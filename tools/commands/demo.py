@@ -4,44 +4,26 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol
-
-import typer
+from typing import Protocol
 
 from weldcal.systems.jobs.job import job_of
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import MOTION, Call, Outcome, ScenarioArgument, ScenarioOption, command, option
-from weldcal.tools.commands.motion_live import run_motion_live
-from weldcal.tools.commands.mounting_live import run_mounting_live
-from weldcal.tools.commands.profiler.live import run_profiler_live
+from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.commands.tablet.demo import run_tablet_demo
-from weldcal.tools.commands.touch import run_touches
 from weldcal.tools.commands.weld import run_calibration_live, run_scenario
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions, run_document
 
 
-@command(
-    "calibrate-live", hidden=True, options=(*MOTION, "record"), short_help="Calibrate a scanner live in a scenario."
-)
-def calibrate_live(
-    call: Call,
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A scenario, by name or path.")],
-    robot: Annotated[str | None, option("--robot", "NAME", "simulated, emulated or a controller's address.")] = None,
-) -> Outcome:
+def calibrate_live(call: Call, scenario: str, robot: str | None) -> Outcome:
     """Calibrate a scanner live in a scenario, as `weldcal calibrate --scenario` does."""
     options = run_options(call, "calibrate", scenario, robot=robot)
     loaded = load_scenario(scenario)
-    kind = job_of(loaded).key
-    if kind == "mounting":
-        mounted = run_mounting_live(loaded, options, call.progress)
-        return Outcome(mounted.summary(), first=mounted.first)
-    if kind == "motion":
-        moved = run_motion_live(loaded, options, call.progress)
-        return Outcome(moved.summary(), first=moved.first)
+    if (kind := kind_of(loaded)) in ("mounting", "motion"):
+        found = runner_of(kind)(loaded, options, call.progress)
+        return Outcome(found.summary(), first=getattr(found, "first", None))
     calibrated = run_calibration_live(options, call.progress)
     return Outcome(calibrated.calibration_summary(), first=calibrated.first)
 
@@ -70,14 +52,25 @@ class RunResult(Protocol):
 
 
 Runner = Callable[[Scenario, RunOptions, Progress], RunResult]
-RUNNERS: dict[str, Runner] = {
-    "": run_scenario,
-    "tablet": run_tablet_demo,
-    "mounting": run_mounting_live,
-    "motion": run_motion_live,
-    "profiler_job": run_profiler_live,
-    "touch": run_touches,
-}
+
+
+def runner_of(key: str) -> Runner:
+    """Return what runs the job with this key; imports it."""
+    runner: Runner = run_any
+    match key:
+        case "":
+            runner = run_scenario
+        case "motion":
+            from weldcal.tools.commands.motion_live import run_motion_live as runner
+        case "mounting":
+            from weldcal.tools.commands.mounting_live import run_mounting_live as runner
+        case "profiler_job":
+            from weldcal.tools.commands.profiler.live import run_profiler_live as runner
+        case "tablet":
+            from weldcal.tools.commands.tablet.demo import run_tablet_demo as runner
+        case "touch":
+            from weldcal.tools.commands.touch import run_touches as runner
+    return runner
 
 
 def kind_of(scenario: Scenario) -> str:
@@ -93,7 +86,7 @@ def run_procedure(options: RunOptions, progress: Progress) -> RunResult:
             written.
     """
     scenario = load_scenario(options.scenario)
-    return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
+    return runner_of(kind_of(scenario))(scenario, options, progress)
 
 
 @dataclass(frozen=True, eq=False)

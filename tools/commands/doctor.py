@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import NAME, DoctorCase, dataset_case, read_case
+from weldcal.calibration.doctor.case import NAME, DoctorCase, case_of, dataset_case, read_case
 from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
 from weldcal.calibration.eye_on_base.observations import fit_flanges, require_flange
@@ -21,12 +21,13 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole
 from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
 from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, FlangeOption, Outcome, command
 from weldcal.tools.commands.cell.tool import MEASURED_TOOL
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
-from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
+from weldcal.tools.commands.weld import SCANS, SUMMARY
 from weldcal.tools.report.doctor import CALIBRATION, DoctorReport, worded
 from weldcal.welding.record.weld_log import CSV_NAME, PICTURE_S, WeldRecord, blind_s, gain_off, load_weld_log
 
@@ -131,6 +132,27 @@ def _found_in(data: Dataset, ids: Sequence[str], standard: FlangeStandard) -> li
         if fit.coverage > _SEEN and fit.bore_radius_m is not None:
             rims.append(fit.rim_rms_m)
     return rims
+
+
+def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
+    """Make the doctor's case of a live calibration; None where the job does not calibrate by a feature."""
+    status = getattr(cell.job, "calibration_status", None)
+    seen = None if status is None else status(root)
+    if seen is None or not seen.observations:
+        return None
+    c, scanner = cell.scenario.calibration, cell.scenario.scanner_config()
+    preset = None if scanner is None else scanner.scanner()
+    return case_of(
+        seen.observations,
+        {},
+        cell.job.X_FR.GetAsMatrix4(),
+        robot=cell.scenario.arm,
+        flange=feature_standard(cell.scenario).designation,
+        refused=seen.refused,
+        guess=c.mounting_guess.pose().GetAsMatrix4(),
+        guess_radius=1e-3 * c.guess_radius_mm,
+        near_far=None if preset is None else (preset.near_m, preset.far_m),
+    )
 
 
 def _recorded(path: Path, progress: Progress) -> Diagnosis:

@@ -16,8 +16,9 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import unit_quaternion
 from weldcal.calibration.data.clouds import CloudError
-from weldcal.calibration.data.dataset import JOINTS, SECOND_JOINTS, Dataset, load_dataset, save_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess, SecondRobot
+from weldcal.calibration.data.writing import JOINTS, SECOND_JOINTS, save_dataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.planning.mounting_estimate import (
@@ -41,7 +42,7 @@ from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import LIVE, Call, FlangeOption, LimitOption, Outcome, RecordOption, command, option
+from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, command
 from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.mounting import MountingReport, RecordedMounting, mounting_report, station_picture
@@ -70,14 +71,8 @@ def hand_eye_live(
     return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
-@command("calibrate-carried", hidden=True, short_help="Calibrate a scanner that an arm carries from scans at rest.")
 def calibrate_recorded(
-    call: Call,
-    dataset: Annotated[Path, typer.Argument(help="A folder with poses and clouds (docs/datasets.md).")],
-    robot: Annotated[str | None, option("--robot", "NAME", "The arm, if dataset.yaml does not name it.")] = None,
-    flange: FlangeOption = None,
-    poses: Annotated[str | None, option("--poses", "FROM:TO", "Use only the scans from one id to another.")] = None,
-    limit_mm: LimitOption = None,
+    call: Call, dataset: Path, robot: str | None, flange: str | None, *, poses: str | None, limit_mm: float | None
 ) -> Outcome:
     """Calibrate a scanner that an arm carries from scans at rest, as `weldcal calibrate` does for such a folder."""
     folder = call.folder("calibrate", dataset.resolve().name)

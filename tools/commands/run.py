@@ -1,5 +1,7 @@
 """Run the job of a scenario for all commands: robot, cell, viewer, recording and the loop."""
 
+from __future__ import annotations
+
 import dataclasses as dc
 import json
 import platform
@@ -10,7 +12,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import typer
@@ -22,10 +24,6 @@ from weldcal.models.documents import nearest
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.cell import Cell, build_cell
-from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.jobs.job import job_of
 from weldcal.systems.operator import Operator, operator_at
 from weldcal.systems.pacing import draw_in_this_thread
@@ -47,14 +45,18 @@ from weldcal.tools.connections import guard
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
-from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
+
+if TYPE_CHECKING:
+    from weldcal.systems.drivers.station_build import PreparedRobot
+    from weldcal.systems.drivers.ur.rtde import UrRtde
 
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
 SLOWEST_PACE = 0.05
 ALMOST = 0.8  # likeness to "emulated" from which on a word is a slip and not the name of a host
+_NO_CONTROLLER = "--dry-run and --pace need a controller: give --robot emulated or the address of a controller."
 GRAVITY = 9.82  # m/s^2, as a controller has it
 RECORDING: Final = "recording.mcap"
 _PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")
@@ -264,20 +266,28 @@ def chosen_robot(
         InputError: the options cannot be combined, or the address is none.
         RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
     """
-    if word is None and not isinstance(scenario.robot, UrRtde) and not scenario.robot.SIMULATED:
+    if word in (None, SIMULATED) and scenario.robot.SIMULATED:
+        if dry_run or pace is not None:
+            raise InputError(_NO_CONTROLLER)
+        yield ChosenRobot("simulated")
+        return
+    from weldcal.systems.drivers.simulated.ur import SimulatedUr  # only here: a simulation needs none of these
+    from weldcal.systems.drivers.ur.rtde import UrRtde
+    from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
+
+    if word is None and not isinstance(scenario.robot, UrRtde):
         if dry_run or pace is not None:
             raise InputError("--dry-run and --pace need a controller: give --robot with its address.")
         yield ChosenRobot(type(scenario.robot).__name__)
         return
     if word is None:
-        word = scenario.robot.host if isinstance(scenario.robot, UrRtde) else SIMULATED
-        if isinstance(scenario.robot, UrRtde) and pace is None and scenario.robot.pace != 1.0:
+        assert isinstance(scenario.robot, UrRtde)
+        word = scenario.robot.host
+        if pace is None and scenario.robot.pace != 1.0:
             pace = scenario.robot.pace
     if word == SIMULATED:
         if dry_run or pace is not None:
-            raise InputError(
-                "--dry-run and --pace need a controller: give --robot emulated or the address of a controller."
-            )
+            raise InputError(_NO_CONTROLLER)
         if isinstance(scenario.robot, UrRtde):
             scenario.robot = SimulatedUr()
         yield ChosenRobot("simulated")
@@ -316,6 +326,9 @@ def _check_pace(pace: float) -> None:
 
 
 def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float, lockstep: bool = False) -> ChosenRobot:
+    from weldcal.systems.drivers.simulated.ur import SimulatedUr
+    from weldcal.systems.drivers.ur.rtde import UrRtde
+
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
     config = dc.replace(config, host=host, pace=pace, lockstep=lockstep or config.lockstep)
     if not dry_run:
@@ -331,6 +344,8 @@ def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float,
 
 def robot_at(host: str, scenario: Scenario) -> UrRtde:
     """Return the robot at an address, with the scenario's tool as its payload."""
+    from weldcal.systems.drivers.ur.rtde import UrRtde
+
     if scenario.tool == "none":
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
     if scenario.tool == "pen":
@@ -347,6 +362,9 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
         RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the
             operator action.
     """
+    from weldcal.systems.drivers.station_build import PreparedRobot
+    from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+
     report = preflight(
         config.host,
         upper_registers=config.upper_registers,

@@ -14,7 +14,8 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
-from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import offset_from, position_errors, scale_error, tilt_errors
 from weldcal.calibration.flange.observation import Observation

@@ -8,13 +8,11 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
-from pydrake.systems.framework import Context
 
 from weldcal.calibration.calibrate import KINEMATICS_FILE
-from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result
-from weldcal.calibration.doctor.case import DoctorCase, case_of
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
 from weldcal.models.errors import InputError
@@ -404,27 +402,6 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
         intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
     )
     return folder
-
-
-def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
-    """Make the doctor's case of a live calibration; None where the job does not calibrate by a feature."""
-    status = getattr(cell.job, "calibration_status", None)
-    seen = None if status is None else status(root)
-    if seen is None or not seen.observations:
-        return None
-    c, scanner = cell.scenario.calibration, cell.scenario.scanner_config()
-    preset = None if scanner is None else scanner.scanner()
-    return case_of(
-        seen.observations,
-        {},
-        cell.job.X_FR.GetAsMatrix4(),
-        robot=cell.scenario.arm,
-        flange=feature_standard(cell.scenario).designation,
-        refused=seen.refused,
-        guess=c.mounting_guess.pose().GetAsMatrix4(),
-        guess_radius=1e-3 * c.guess_radius_mm,
-        near_far=None if preset is None else (preset.near_m, preset.far_m),
-    )
 
 
 def _numbers(values: np.ndarray) -> list[float]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,15 +14,7 @@ from weldcal.calibration.planning.calibration_poses import PlannerConfig, predic
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.cell import Cell
-from weldcal.systems.jobs.motion.job import AddedMotion
-from weldcal.systems.jobs.mounting.job import AddedMounting
-from weldcal.systems.jobs.profiler.job import AddedProfilerJob
-from weldcal.systems.jobs.profiler.procedure import PLANS
-from weldcal.systems.jobs.tablet.job import AddedVisit
-from weldcal.systems.jobs.tool_scan.job import AddedToolScan
-from weldcal.systems.jobs.touch.job import AddedTouches
-from weldcal.systems.jobs.touch.planner import TouchConfig
-from weldcal.systems.jobs.touch.procedure import Felt
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
@@ -37,6 +29,9 @@ from weldcal.systems.phase_words import (
     WATCH_STEPS,
 )
 from weldcal.welding.servo.guards import ArmGuardConfig
+
+if TYPE_CHECKING:
+    from weldcal.systems.jobs.touch.procedure import Felt
 
 SCAN = "scan"
 # About how long steps take at speed_factor 1, s; of these the moves take longer at a lower one.
@@ -109,26 +104,28 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
     """Steps and limits of the jobs besides the weld; a job of another package has none."""
     job, c = cell.job, cell.scenario.calibration
     facts = partial(Facts, title=title, robot=robot, settable_pace=settable)
-    if isinstance(job, AddedMounting):
-        return facts(
-            steps=MOUNTING_STEPS,
-            required_mm=c.required_error_mm,
-            maximum_scans=c.maximum_scans,
-            minimum_scans=c.minimum_scans,
-        )
-    if isinstance(job, AddedMotion):
-        return facts(steps=MOTION_STEPS if job.monitor is None else WATCH_STEPS, maximum_scans=job.frames)
-    if isinstance(job, AddedVisit):
-        return facts(steps=TABLET_STEPS, maximum_scans=len(job.plan.q_above))
-    if isinstance(job, AddedTouches):
-        touch = cell.scenario.part(TouchConfig)
-        press_mm = math.nan if touch is None else touch.press_mm
-        return facts(steps=TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m)
-    if isinstance(job, AddedToolScan):
-        return facts(steps=TOOL_SCAN_STEPS, maximum_scans=len(job.views))
-    if isinstance(job, AddedProfilerJob):
-        keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
-        return facts(steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys))
+    match job_of(cell.scenario).key:
+        case "mounting":
+            return facts(
+                steps=MOUNTING_STEPS,
+                required_mm=c.required_error_mm,
+                maximum_scans=c.maximum_scans,
+                minimum_scans=c.minimum_scans,
+            )
+        case "motion":
+            return facts(steps=MOTION_STEPS if job.monitor is None else WATCH_STEPS, maximum_scans=job.frames)
+        case "tablet":
+            return facts(steps=TABLET_STEPS, maximum_scans=len(job.plan.q_above))
+        case "touch":
+            press_mm = cell.scenario.touch.press_mm  # type: ignore[attr-defined]
+            return facts(steps=TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m)
+        case "tool_scan":
+            return facts(steps=TOOL_SCAN_STEPS, maximum_scans=len(job.views))
+        case "profiler_job":
+            from weldcal.systems.jobs.profiler.procedure import PLANS
+
+            keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
+            return facts(steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys))
     return facts()
 
 

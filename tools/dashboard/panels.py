@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.procedure import MountingState, MountingStatus
-from weldcal.systems.jobs.profiler.procedure import ProfilerState
-from weldcal.systems.jobs.tablet.procedure import TabletState
-from weldcal.systems.jobs.touch.procedure import TouchState
-from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.viewer.live import Moment
 from weldcal.tools.dashboard.facts import Facts
+
+if TYPE_CHECKING:
+    from weldcal.systems.jobs.mounting.procedure import MountingStatus
+    from weldcal.systems.jobs.profiler.procedure import ProfilerState
+    from weldcal.systems.jobs.tablet.procedure import TabletState
+    from weldcal.systems.jobs.touch.procedure import TouchState
+    from weldcal.systems.motion.drift_monitor import DriftStatus
 
 ROWS = 240  # of a curve that is sent
 X, Y, Z, PLAIN = "x", "y", "z", "line"  # the page's colours of curves
@@ -25,34 +26,37 @@ _NEWEST_FRAMES = 200
 
 def stage_of(moment: Moment) -> str:
     """The key of the present step in the facts' steps: the command's phase, or what the state of another job says."""
-    state = moment.shown.get("state")
+    state: Any = moment.shown.get("state")
     if moment.command.finished:
         return moment.command.phase
-    if isinstance(state, MountingState):
-        if state.label:
-            return state.purpose
-        return "start" if state.visit < 0 else "verify" if state.purpose == "calibrate" else "home"
-    if isinstance(state, ProfilerState):
-        return state.step or "start"
-    if isinstance(state, TabletState | TouchState | MotionState):
-        return state.phase
+    match type(state).__name__:  # by its name: the modules of the jobs that do not run are not imported
+        case "MountingState" if state.label:
+            return str(state.purpose)
+        case "MountingState":
+            return "start" if state.visit < 0 else "verify" if state.purpose == "calibrate" else "home"
+        case "ProfilerState":
+            return str(state.step) or "start"
+        case "TabletState" | "TouchState" | "MotionState":
+            return str(state.phase)
     return moment.command.phase
 
 
 def panel(facts: Facts, moment: Moment) -> dict[str, Any] | None:
     """Heading, note, plots and lines of a job besides the weld; None where it has nothing to show."""
-    state = moment.shown.get("state")
-    status = moment.shown.get("status")
-    if isinstance(status, MountingStatus):
-        return _mounting(facts, status)
-    if isinstance(state, MotionState):
-        drift = moment.shown.get("drift")
-        return _drift(drift) if isinstance(drift, DriftStatus) else _motion(facts, moment)
-    if isinstance(state, TabletState):
-        return _tablet(facts, state)
-    if isinstance(state, TouchState):
-        return _touch(facts, state)
-    return _profiler(state) if isinstance(state, ProfilerState) else None
+    state: Any = moment.shown.get("state")
+    match type(state).__name__:
+        case "MountingState" if (status := moment.shown.get("status")) is not None:
+            return _mounting(facts, status)
+        case "MotionState":
+            drift = moment.shown.get("drift")
+            return _motion(facts, moment) if drift is None else _drift(drift)
+        case "TabletState":
+            return _tablet(facts, state)
+        case "TouchState":
+            return _touch(facts, state)
+        case "ProfilerState":
+            return _profiler(state)
+    return None
 
 
 def _mounting(facts: Facts, status: MountingStatus) -> dict[str, Any]:
@@ -90,6 +94,8 @@ def _mounting(facts: Facts, status: MountingStatus) -> dict[str, Any]:
 
 
 def _motion(facts: Facts, moment: Moment) -> dict[str, Any]:
+    from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionRecord
+
     record, found = moment.shown.get("record"), moment.shown.get("calibration")
     record = record if isinstance(record, MotionRecord) else MotionRecord()
     waits = 1e3 * np.array(record.waits_s[-_NEWEST_FRAMES:])

@@ -34,7 +34,7 @@ from weldcal.tools.report.first_screen import (
     work_point_expected,
 )
 from weldcal.tools.report.monitor import drift_document
-from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
+from weldcal.tools.report.pictures import OURS, ROBOT, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import (
@@ -439,13 +439,11 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:
-    """Draw the errors of the estimate in use and Algorithm 1's own figure against the scans taken (Fig. 11)."""
-    n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
+    """Draw the errors of the estimate in use against the scans taken."""
+    n, expected, held_out = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
     picture, axes = subplots(7.2, 3.4)
     axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")
     axes.semilogy(n, 1e3 * held_out, "s--", color=ROBOT, label="held out, at the ring (median)")
-    if np.isfinite(figure).any():
-        axes.semilogy(n, 1e3 * figure, "^:", color=THEIRS, label="Algorithm 1: its own ICP figure")
     axes.axhline(1e3 * required_m, color=TRUTH, lw=1.0, label="required")
     millimetres(axes)
     axes.set_xticks(n)

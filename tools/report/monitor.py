@@ -1,17 +1,18 @@
 """The result of `weldcal monitor` on a recording and its page: error, offset and drift over time."""
 
+from __future__ import annotations
+
 import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
-from weldcal.calibration.motion.drift.watch import DriftHistory
 from weldcal.models.arrays import Array
 from weldcal.tools.report.first_screen import (
     SCANNER,
@@ -26,6 +27,9 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
+
+if TYPE_CHECKING:
+    from weldcal.calibration.motion.drift.watch import DriftHistory
 
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
 

@@ -25,7 +25,7 @@ from weldcal.systems.messages import SeamRecord
 from weldcal.systems.runner import Run
 from weldcal.systems.station import Truth
 from weldcal.tools.report.render import csv_text
-from weldcal.welding.locate.part.joint import FIT_UP, FitUp
+from weldcal.welding.locate.part.fit_up import FIT_UP, FitUp
 from weldcal.welding.passes.felt import WeldPass
 from weldcal.welding.record.process import PathError, path_error, wire_angles
 from weldcal.welding.record.welded_seam import touch_numbers

@@ -285,7 +285,7 @@ def weld_record(
         "axial_d_m": config.deflection.axial_d_m,
         "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
-        "law": config.law,
+        "law": "guarded",  # the only one; older logs may name another
         "start_s": cell.scenario.welding.arc.start_s,
         "crater_s": cell.scenario.welding.arc.crater_s,
         "woven": bool(config.weave.amplitude_m),

@@ -1,9 +1,11 @@
 """Plans root and tip path from scans: by the drawing registered to them, or from the cloud alone."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +19,14 @@ from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.seat import Press
-from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove.extract import extract_groove
-from weldcal.welding.locate.part.joint import MOST_M, REACH_M, FitUp, MeasuredJoint, measure_fit_up, measure_joint
-from weldcal.welding.locate.part.model import PartModel
-from weldcal.welding.locate.part.registration import register_prepared
-from weldcal.welding.locate.part.result import PartConfig, PartRegistration
-from weldcal.welding.locate.part.scan import prepare
+from weldcal.welding.locate.part.fit_up import FitUp
 from weldcal.welding.locate.planes import Floats, finite_points, into
 from weldcal.welding.locate.registration import register_workpiece
 from weldcal.welding.seam.curve import SeamCurve, ringed
+
+if TYPE_CHECKING:
+    from weldcal.welding.locate.part.joint import MeasuredJoint
+    from weldcal.welding.locate.part.result import PartConfig, PartRegistration
 
 METHODS = ("cad", "cloud")
 SEARCHES = ("guess", "anywhere")
@@ -101,6 +101,13 @@ def locate_part(
     Raises:
         PartNotFound, AmbiguousPart, InputError: as register_part.
     """
+    # only here: a plate, or a cloud alone, needs none of it
+    from weldcal.welding.locate.part.joint import measure_fit_up, measure_joint
+    from weldcal.welding.locate.part.model import PartModel
+    from weldcal.welding.locate.part.registration import register_prepared
+    from weldcal.welding.locate.part.result import PartConfig
+    from weldcal.welding.locate.part.scan import prepare
+
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
     model = PartModel(mesh, config.seed)
@@ -114,6 +121,7 @@ def locate_part(
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
     """All of the scan's points (N,3) in the box about the seam, with normals (N,3) towards the eye (3,)."""
     from weldcal.models.mesh import o3d
+    from weldcal.welding.locate.part.joint import MOST_M, REACH_M
 
     reach = REACH_M + 2.0 * MOST_M
     low, high = seam.points_P.min(axis=0) - reach, seam.points_P.max(axis=0) + reach
@@ -180,6 +188,8 @@ def plan_root(
     if not isinstance(points_B, np.ndarray):
         raise InputError("Several scans are for a part from a file: scan a plate from one pose.")
     if method.method == "cloud":
+        from weldcal.welding.locate.groove.extract import extract_groove
+
         groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
         return RootPlan(
             root=groove.curve.position(np.linspace(0.0, groove.curve.length, len(groove.curve.knots))),
@@ -193,6 +203,8 @@ def plan_root(
         )
     if method.search == "anywhere":
         x = X_BP_guess.rotation().matrix()[:, 0]
+        from weldcal.welding.locate.find_workpiece import find_workpiece
+
         found = find_workpiece(points_B, workpiece, turn_hint_rad=math.atan2(x[1], x[0]), eye_B=eye_B)
         registration, confidence, summary = found.registration, found.confidence, found.summary
     else:

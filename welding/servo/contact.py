@@ -39,13 +39,11 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     deflection = (frame.deflection_T if state.zero is None else frame.deflection_T - state.zero) / state.gain
     X_BT = frame.X_BT_at_capture
     point = tip_point(X_BT, deflection)
-    # The published laws use the plan's frame alone.
-    corrects_frame = state.proven and config.law == "guarded"
-    felt = felt_turn(state, point, seam, config) if corrects_frame else 0.0
+    felt = felt_turn(state, point, seam, config) if state.proven else 0.0
     seam = turned(seam, felt)
     p_BT = np.asarray(X_BT.translation())
     delta = p_BT - point
-    steer = _steering(state, delta, seam, config) if corrects_frame else 0.0
+    steer = _steering(state, delta, seam, config) if state.proven else 0.0
     seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
     same = state.reading is not None and bool(np.array_equal(frame.deflection_T, state.reading))

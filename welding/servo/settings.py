@@ -357,7 +357,7 @@ class ServoConfig:
     """All settings of the welding servo.
 
     Attributes:
-        weld_speed_m_s: torch speed, the primary variable; law: a name of welding.servo.laws.
+        weld_speed_m_s: torch speed, the primary variable.
         period_s: servo tick; lag_s: delay between command and motion of the robot, which the torch's equations look
             ahead by.
         felt: whether the tip is used; else it hangs clear and the torch follows the plan.
@@ -385,7 +385,6 @@ class ServoConfig:
     weld_speed_m_s: float = 8.0e-3
     period_s: float = 0.008
     lag_s: float = 0.025
-    law: str = "guarded"
     felt: bool = True
 
     def __post_init__(self) -> None:

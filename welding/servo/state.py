@@ -156,8 +156,6 @@ class WeldingState:
     same_readings: int = 0
     delta_n: float = 0.0
     delta_axial: float = 0.0
-    delta_wanted: float | None = None
-    axial_paused: bool = False
     regained: int = 0
     proven: bool = False
     settling: bool = False

@@ -25,11 +25,10 @@ from weldcal.welding.servo.contact import (
 from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step, mean_residual
 from weldcal.welding.servo.felt_before import with_felt_before
-from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import check_length, touch_step
-from weldcal.welding.servo.track import TickMotion, TorchTarget, torch_target, weaving
+from weldcal.welding.servo.track import TickMotion, TorchTarget, guarded_motion, torch_target, weaving
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
@@ -177,7 +176,7 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
 def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
-    feels_start = config.felt and config.touch.feel_start and get_law(config.law).guarded
+    feels_start = config.felt and config.touch.feel_start
     assert state.plan_fit is not None
     seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
     if not config.felt:
@@ -220,17 +219,9 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     limits, end_window = config.contact, config.gap.end_window_m
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
-        lost, law = contact_lost(before, state, config), get_law(config.law)
-        if law.guarded and (hop := config.hop_at(state.s_tip)) is not None and state.s_tip < hop.up:
+        lost = contact_lost(before, state, config)
+        if (hop := config.hop_at(state.s_tip)) is not None and state.s_tip < hop.up:
             return changed(_coasting(drop(state), hop.down), settling=True)
-        if not law.guarded:
-            # The paper appends every point and does not detect contact; the wanted deflection without contact is an
-            # interpretation.
-            return changed(
-                with_point(state, config),
-                delta_wanted=0.0 if lost and law.lost == "zeroed" else None,
-                axial_paused=lost,
-            )
         if not lost:
             return with_point(raised(state, config), config)
         state = drop(state)
@@ -339,7 +330,7 @@ def _ended(state: WeldingState, config: ServoConfig) -> WeldingState:
     if state.phase == Phase.COAST and state.s_tip - state.lost_at > config.gap.coast_m:
         text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return fault(state, text)
-    if not get_law(config.law).guarded or state.phase == Phase.FINISH:
+    if state.phase == Phase.FINISH:
         return state
     # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
     last = state.plan_fit.curve.drawn_m if cut_short and tracks else state.s_end
@@ -359,7 +350,7 @@ def _moved(
     target = torch_target(state, state.plan_fit.curve, p_BW, config)
     if state.torch_on and config.weave.amplitude_m > 0.0:
         state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
-    motion = motion_law(get_law(config.law))(
+    motion = guarded_motion(
         state, sample.X_BT, turned(seam, state.felt + state.steer), target, (state.u_n, state.u_a), config, dt
     )
     e = p_BW - target.point
@@ -430,10 +421,7 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
     if state.phase == Phase.TRACK:
         # A late frame shows where the tip was, not where it is: its correction fades out.
         fresh = freshness(state, sample.time)
-        seek = deflection.delta_d_m if state.delta_wanted is None else state.delta_wanted
-        lateral = deflection.k_p * (seek - state.delta_n)
-        if state.axial_paused:
-            return fresh * lateral, 0.0
+        lateral = deflection.k_p * (deflection.delta_d_m - state.delta_n)
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
     wanted, rise = state.hold + _press(config), np.zeros(2)
     if state.phase == Phase.COAST:

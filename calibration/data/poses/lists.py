@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
-from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
+from weldcal.calibration.data.poses.names import ENDINGS, TREES, last_key, natural, number_of, whose
 from weldcal.calibration.data.poses.storage import matlab_arrays, read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import keyed_lists, lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
@@ -21,15 +21,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
-TEXT = (
-    ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc",
-    ".urp", ".sys", ".jbi",
-    ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out", ".tfm", ".g2o",
-)  # fmt: skip
-TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
-ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
-ENDINGS = (*TEXT, *TREES, *ARRAYS)
-"""Endings of files that may hold poses."""
 _OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
 _CLOUDS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd")
 PICKLED = (

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,17 +11,25 @@ from weldcal.calibration.data.checks import JOINT_NAME, read_rows
 from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import ENDINGS as READ
-from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, joint_columns, natural, number_of, whose
+from weldcal.calibration.data.poses.names import (
+    BASES,
+    ENDINGS,
+    FLANGES,
+    columns_of,
+    joint_columns,
+    natural,
+    number_of,
+    whose,
+)
 from weldcal.calibration.data.poses.readings import PoseReading, pick
-from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import require_few_lines
+
+if TYPE_CHECKING:
+    from weldcal.calibration.data.poses.listing import Listing
 
 FOLDERS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd", "points", "depth", "depth_images", "images")
 _NOTES = ("readme", "notes")
@@ -220,7 +229,7 @@ def _files(folder: Path) -> list[Path]:
     found = [
         p
         for p in folder.iterdir()
-        if p.suffix.lower() in READ and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
+        if p.suffix.lower() in ENDINGS and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
     ]
     return sorted(found, key=lambda p: natural(p.name))
 
@@ -230,6 +239,9 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm, arm: str = "") -
 
     Raises DatasetError, one sentence that says what to change.
     """
+    from weldcal.calibration.data.poses.lists import lists_of_file, read_lists  # poses.csv needs none of these readers
+    from weldcal.calibration.data.poses.trees import stacked
+
     if isinstance(source, tuple):
         lists = [lists_of_file(path) for path in source]
         many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
@@ -262,7 +274,7 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm, arm: str = "") -
     )
 
 
-def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
+def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
     """Return the list of the flange's poses among those of a file.
 
     The only one, the one of the flange's frame, or the one that names the robot.

@@ -13,8 +13,8 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import ENDINGS, PICKLED, folder_lists, read_lists
-from weldcal.calibration.data.poses.names import mounting_name
+from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists
+from weldcal.calibration.data.poses.names import ENDINGS, mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.errors import DatasetError, InconsistentPoses

@@ -1,6 +1,6 @@
 """Test a calibration sequentially: has the scanner moved, when, by how much and in which direction."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ from weldcal.models.arrays import Array
 MOVED, CREEP, WARM_UP = "moved", "creep", "warm-up"
 ROBOT_OR_SCANNER = "the scanner or the robot's base moved"
 OR_WARM_UP = "the scanner or the robot's base moves, or the scanner warms up"
+_CLOCK_S = 2e-3  # a choice: one period of a robot's stream at 500 Hz
+_MOST_SPREAD_M = 5e-4  # a choice: three times the usual spread of solve.py; more would hide a move of a millimetre
 _RIGID = np.arange(SCALE)  # move and clock: a clock that jumps is no move
 _SCALED = np.array([SCALE, CLOCK])
 _REFUSED = 15.0  # twice the log likelihood at which five unknowns fewer are refused at 1 %
@@ -389,3 +391,17 @@ class DriftTest:
 
 def _joined(parts: list[Rows]) -> Rows:
     return Rows(*(np.concatenate([getattr(p, name) for p in parts]) for name in Rows.__dataclass_fields__))
+
+
+def drift_config(
+    sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
+) -> DriftConfig:
+    """Return the test's settings for a calibration.
+
+    Its spread of scanner and arm is that of the field, where it states a larger one.
+    """
+    config = config or DriftConfig()
+    spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
+    clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
+    known: FilterConfig = replace(config.filter, clock_s=clock, field=replace(config.filter.field, sigma_m=spread))
+    return replace(config, filter=known)

@@ -11,9 +11,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import DEVICE, correction_from_document
 from weldcal.calibration.geometry.robust import MAD
-from weldcal.calibration.motion.drift.hypotheses import FilterConfig
 from weldcal.calibration.motion.drift.residuals import CLOCK, FrameNoise, Rows, measured_noise, rows_of
-from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest, drift_config
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import Synchronised, synchronise
@@ -34,8 +33,6 @@ SCANNER, BASE = "the scanner moved", "the robot's base moved, and the scanner di
 
 _GROSS = 60.0  # chi-square with 5 of a frame that shows something else
 _LARGE_M, _LARGE_RAD = 1e-3, 2e-3  # a move that may have disturbed the clock's fit
-_CLOCK_S = 2e-3  # a choice: one period of a robot's stream at 500 Hz
-_MOST_SPREAD_M = 5e-4  # a choice: three times the usual spread of solve.py; more would hide a move of a millimetre
 _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show it
 
 
@@ -187,20 +184,6 @@ def watch(
         clock = synchronise(replace(frames, p_C=p_C, n_C=n_C), motion, result.X_BC, X_FR=X_FR, known=result.clock)
         found = _tested(result, frames, motion, clock, X_FR, dropped, config)
     return found
-
-
-def drift_config(
-    sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
-) -> DriftConfig:
-    """Return the test's settings for a calibration.
-
-    Its spread of scanner and arm is that of the field, where it states a larger one.
-    """
-    config = config or DriftConfig()
-    spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
-    clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
-    known: FilterConfig = replace(config.filter, clock_s=clock, field=replace(config.filter.field, sigma_m=spread))
-    return replace(config, filter=known)
 
 
 def _tested(

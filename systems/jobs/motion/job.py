@@ -139,15 +139,7 @@ class MotionCalibrationJob(Job[MotionPlanned]):
     def check(self, scenario: Scenario) -> None:
         """See Job."""
         job, streams = scenario.part(MotionJob), _stream_delay_s(scenario) is not None
-        if job is None:
-            if streams and any(
-                getattr(scenario, key, None) is not None for key in ("mounting", "profiler_job", "tablet")
-            ):
-                raise InputError(
-                    "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job:"
-                    " write motion: {} or another scanner."
-                )
-            return
+        assert job is not None
         check_motion(job)
         if not streams:
             raise InputError(

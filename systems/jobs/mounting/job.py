@@ -31,12 +31,11 @@ from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import base_circle
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.background import Answer, Background, BackgroundSystem
-from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
+from weldcal.systems.jobs.mounting.config import MountingJob
 from weldcal.systems.jobs.mounting.procedure import (
     HeldOutScan,
     MountingProcedure,
@@ -210,14 +209,6 @@ class MountingCalibrationJob(Job[MountingPlanned]):
 
     def check(self, scenario: Scenario) -> None:
         """See Job."""
-        scanner = scenario.scanner_config()
-        check_mounting(
-            scenario.calibration.configuration,
-            scenario.part(MountingJob),
-            "base" if scanner is None else scanner.mounted_on,
-            second_robot=not isinstance(scenario.robot_2, NoDevice),
-            weld=scenario.job.weld,
-        )
         job = scenario.part(MountingJob)
         if job is not None and job.second_arm is not None:
             check_home(job.second_arm.home_deg, job.second_arm.arm, "mounting.second_arm.home_deg")

@@ -119,10 +119,7 @@ def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groov
     Raises:
         InputError: one sentence that says what to change.
     """
-    if job is None:
-        if has_profiler:
-            raise InputError("A profiler needs a job: write profiler_job: {} in the scenario.")
-        return
+    assert job is not None
     if not has_profiler:
         raise InputError("profiler_job needs a profiler: write profiler: !RenderedProfiler {} in the scenario.")
     if tool != "none":

@@ -63,16 +63,13 @@ class TabletConfig:
 
 
 def check_tablet(scenario: Scenario) -> None:
-    """Check the tablet job of a scenario; a scenario without one passes.
+    """Check the tablet job of a scenario.
 
     Raises:
         InputError: one sentence that says what to change.
     """
     tablet = scenario.part(TabletConfig)
-    if tablet is None:
-        if scenario.tool == "pen":
-            raise InputError("A pen touches a tablet: write tablet: {} in the scenario, or another tool.")
-        return
+    assert tablet is not None
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
             "The tablet job neither calibrates a scanner nor welds: run it with weldcal demo or weldcal tablet "

@@ -43,14 +43,13 @@ class ToolScanConfig:
 
 
 def check_tool_scan(scenario: Scenario) -> None:
-    """Check the tool scan of a scenario; a scenario without one passes.
+    """Check the tool scan of a scenario.
 
     Raises:
         InputError: one sentence that says what to change.
     """
     config, scanner = scenario.part(ToolScanConfig), scenario.scanner_config()
-    if config is None:
-        return
+    assert config is not None
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
             "The tool scan neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with"

@@ -45,14 +45,13 @@ class TouchConfig:
 
 
 def check_touch(scenario: Scenario) -> None:
-    """Check the touch job of a scenario; a scenario without one passes.
+    """Check the touch job of a scenario.
 
     Raises:
         InputError: one sentence that says what to change.
     """
     touch = scenario.part(TouchConfig)
-    if touch is None:
-        return
+    assert touch is not None
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
             "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with"

@@ -9,9 +9,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange.face import IN_MOTION
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.motion.frames import IN_MOTION
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard

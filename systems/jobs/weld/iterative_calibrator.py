@@ -9,25 +9,15 @@ from pydrake.systems.framework import Context, State
 
 from weldcal.calibration.calibrate import PLAIN, Refined, Steps, calibrate
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.estimate import sigma_at
+from weldcal.calibration.eye_on_base.estimate import corrected_observation, sigma_at
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
-from weldcal.calibration.flange.observation import Observation, observation_from_fit
+from weldcal.calibration.flange.observation import observation_from_fit
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
-from weldcal.calibration.published.algorithm1 import (
-    COST_AXES,
-    Algorithm1State,
-    algorithm1_start,
-    algorithm1_step,
-    make_verification,
-    named_cost,
-)
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, Refinement, VerificationResult
@@ -124,24 +114,18 @@ class CalibrationPosePlanner(LeafSystem):
 
 @dc.dataclass(frozen=True, kw_only=True)
 class CalibratorConfig:
-    """The stop criterion of the live calibration (m), and the work point p_BWork (3,) in B at which it holds.
-
-    The cost is that of Algorithm 1 (section 4.2: work radius, m, and axes).
-    """
+    """The stop criterion of the live calibration (m), and the work point p_BWork (3,) in B at which it holds."""
 
     required_error_m: float
     minimum_scans: int
     maximum_scans: int
     p_BWork: Array
-    cost: str = "translation"
-    work_radius_m: float = 0.2
-    cost_axes: tuple[str, ...] = COST_AXES
     correct_scanner: bool = True
     refine: str = PLAIN
 
 
 class IterativeCalibrator(BackgroundSystem):
-    """Computes Algorithm 1 with its pool of four, and the robust estimate from all scans, which is the result.
+    """Computes the robust estimate from all scans.
 
     .. pydrake_system::
 
@@ -155,22 +139,19 @@ class IterativeCalibrator(BackgroundSystem):
     The estimate is that of `weldcal calibrate` (calibration/calibrate.py): it contains a correction of the scanner's
     own errors where the scans show one, unless `correct_scanner` is off. It is done when the expected error at the work
     point is within the required one; then it is refined (`refine`), and what the status says of the arm holds for the
-    verification and all that follows. Algorithm 1's figure is kept for display only, because it does not measure the
-    remaining error (docs/calibration.md).
+    verification and all that follows.
     """
 
     def __init__(
         self,
         arm: ArmModel,
         X_FR: RigidTransform,
-        standard: FlangeStandard,
         config: CalibratorConfig,
         background: Background | None = None,
         period_s: float = 0.02,
     ) -> None:
         super().__init__("calibration_status", CalibrationStatus(), background, period_s)
         self._arm, self._X_FR, self._config = arm, X_FR, config
-        self._standard = standard
         self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
 
@@ -186,14 +167,13 @@ class IterativeCalibrator(BackgroundSystem):
             return None
         arm, q = newest.arm_or(self._arm), self._history.Eval(context).joints_at(estimate.capture_time)
         X_BR = None if q is None else forward_kinematics(arm, q) @ self._X_FR
-        return self.background.ask(digest, newest, estimate, X_BR, self._standard, self._config, q, self._arm)
+        return self.background.ask(digest, newest, estimate, X_BR, self._config, q, self._arm)
 
 
 def digest(
     status: CalibrationStatus,
     seen: FlangeEstimate,
     X_BR: RigidTransform | None,
-    standard: FlangeStandard,
     config: CalibratorConfig,
     q: Array | None = None,
     arm: ArmModel | None = None,
@@ -209,16 +189,12 @@ def digest(
     if seen.fit is None or X_BR is None:
         reason = seen.reason or "the arm's pose at the time of the scan is not known"
         return dc.replace(status, refused=(*status.refused, (seen.label, reason)), message=reason)
-    if seen.purpose == "verification_cloud" and seen.points_C is not None:
-        return dc.replace(status, verification_cloud=make_verification(seen.points_C, X_BR, standard))
     if seen.purpose == "verify":
         return dc.replace(status, verifications=(*status.verifications, verify_at(status, seen, X_BR)))
     observation = observation_from_fit(seen.label, X_BR, seen.fit)
     observations = (*status.observations, observation)
     joints = status.joints if q is None else (*status.joints, q)
-    status = dc.replace(
-        status, observations=observations, joints=joints, algorithm_1=_algorithm_1(status, observation, config)
-    )
+    status = dc.replace(status, observations=observations, joints=joints)
     try:
         if len(observations) < ENOUGH:
             raise TooFewPoses(f"{len(observations)} usable scans do not fix the scanner's pose; take {ENOUGH} or more.")
@@ -229,14 +205,13 @@ def digest(
     if found.warnings:
         estimate = dc.replace(estimate, warnings=(*found.warnings, *estimate.warnings))
     predicted = sigma_at(estimate, config.p_BWork)
-    figure = status.algorithm_1.cost if status.algorithm_1 is not None else np.nan
     held_out = float(np.median(estimate.held_out.position_m))
     done = len(observations) >= config.minimum_scans and predicted <= config.required_error_m
     status = dc.replace(
         status,
         estimate=estimate,
         predicted_error_m=predicted,
-        history=(*status.history, (len(observations), predicted, held_out, figure)),
+        history=(*status.history, (len(observations), predicted, held_out)),
         done=done,
         message="",
     )
@@ -258,17 +233,6 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
     return VerificationResult(
         seen.label, float(position_errors(X_BC, seen_at)[0]), float(tilt_errors(X_BC, seen_at)[0])
     )
-
-
-def _algorithm_1(
-    status: CalibrationStatus, observation: Observation, config: CalibratorConfig
-) -> Algorithm1State | None:
-    """One step of the published algorithm, where its verification cloud is available."""
-    if status.verification_cloud is None:
-        return None
-    cost = named_cost(config.cost, config.work_radius_m, config.cost_axes)
-    state = status.algorithm_1 or algorithm1_start(config.required_error_m, config.maximum_scans)
-    return algorithm1_step(state, observation, status.verification_cloud, cost)
 
 
 @dc.dataclass(frozen=True, eq=False)

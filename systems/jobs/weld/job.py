@@ -26,7 +26,6 @@ from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
     calibrator_config,
     check_scan_moves,
-    check_scan_poses,
     feature_on_flange,
     feature_standard,
     job_plan,
@@ -49,7 +48,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
-from weldcal.welding.locate.part.joint import read_limits
+from weldcal.welding.locate.part.fit_up import read_limits
 from weldcal.welding.passes.travel import SeamTravel
 from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.settings import ServoConfig
@@ -214,7 +213,7 @@ class WeldJob(AddedJob):
         phase, order = command.phase, self.travel.order
         seams, seam = len(order), order.index(command.seam)
         share = SHARES.get(phase, 0.05)
-        if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
+        if phase in ("move_to_pose", "scan_pose"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
         welds, weld = seams * self.passes, seam * self.passes + command.weld_pass
@@ -237,10 +236,6 @@ class WeldJob(AddedJob):
 class Weld(Job[tuple[PlannedPose, ...]]):
     """The default job: that of a scenario without another job's part."""
 
-    def check(self, scenario: Scenario) -> None:
-        """See Job; check_scenario contains this job's other checks."""
-        check_scan_poses(scenario)
-
     def plan(self, scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
         """See Job: every calibration and verification pose."""
         check_scan_moves(scenario, station)
@@ -262,7 +257,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         )
         calibrator = wiring.add(
             "iterative_calibrator",
-            IterativeCalibrator(station.arm, X_FR, standard, calibrator_config(scenario), station.background),
+            IterativeCalibrator(station.arm, X_FR, calibrator_config(scenario), station.background),
         )
         status = calibrator.GetOutputPort("calibration_status")
         chooser = wiring.add("calibration_pose_planner", CalibrationPosePlanner(plan))

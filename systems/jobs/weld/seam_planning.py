@@ -21,7 +21,7 @@ from weldcal.models.workpieces.seat import Press
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, free_move, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView, SeamRecord
-from weldcal.welding.locate.part.joint import FitUp, check_fit_up
+from weldcal.welding.locate.part.fit_up import FitUp, check_fit_up
 from weldcal.welding.locate.planning import (
     OVERLAP_M,
     TIP_AHEAD,

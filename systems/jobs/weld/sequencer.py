@@ -56,7 +56,7 @@ class JobState(ProcedureState):
     """State of the sequencer.
 
     Attributes:
-        purpose: of the newest scan: verification_cloud, calibrate, verify or workpiece.
+        purpose: of the newest scan: calibrate, verify or workpiece.
         label: of the newest scan.
         streaming: the finger camera streams.
         process_on: the process is enabled.
@@ -156,7 +156,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     inputs = JobInputs
     moves = (
-        *("move_home", "move_to_verification_cloud", "move_to_pose", "move_to_verify", "park"),
+        *("move_home", "move_to_pose", "move_to_verify", "park"),
         *("move_to_scan", "leave_scan", "interpass"),
         *("approach_above", "approach", "retract", "home"),
     )
@@ -174,7 +174,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             move_timeout_s=plan.move_timeout_s,
             maximum_time_s=plan.maximum_time_s,
             timeouts={
-                **dict.fromkeys(("scan_verification_cloud", "scan_pose", "scan_verify"), no_scan),
+                **dict.fromkeys(("scan_pose", "scan_verify"), no_scan),
                 "scan_workpiece": (
                     plan.scan_timeout_s * max(1, len(plan.scan_poses)),  # the plan from all of them is made in it
                     late.format("No workpiece scan", plan.scan_timeout_s),
@@ -243,7 +243,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
 
     def _begin(self, s: JobState, now: JobInputs) -> JobState:
         if self._plan.calibrate:
-            return self._to_next_pose(s, now, "move_to_verification_cloud")
+            return self._to_next_pose(s, now, "move_to_pose")
         return self._homeward(s, now, "park")
 
     def _homeward(self, s: JobState, now: JobInputs, phase: str, **changes: Any) -> JobState:
@@ -382,8 +382,6 @@ class JobSequencer(Procedure[JobState, JobInputs]):
     steps: ClassVar = {
         "start": _start,
         "move_home": _begin,
-        "move_to_verification_cloud": _arrive_and_scan("verification_cloud", "scan_verification_cloud"),
-        "scan_verification_cloud": _digested,
         "move_to_pose": _arrive_and_scan("calibrate", "scan_pose"),
         "scan_pose": _digested,
         "move_to_verify": _arrive_and_scan("verify", "scan_verify"),

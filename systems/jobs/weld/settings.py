@@ -28,7 +28,6 @@ from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorCon
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
-from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import AnglesOrder, Scenario, WeldingConfig
 from weldcal.systems.station import Station
 from weldcal.welding.passes.stitch import StitchConfig
@@ -52,7 +51,7 @@ from weldcal.welding.servo.weave import WEAVE_SHARE, Bound, WeaveConfig, check_w
 
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
-SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
+SPARE_POSES = 2  # to replace refused scans
 # a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind
 # the others
 NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
@@ -212,7 +211,6 @@ def _straight_on(scenario: Scenario, station: Station, seam: int) -> ServoConfig
         gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
-        law=welding.law,
         tacks=tacks,
         angles=angles,
         stitch=StitchConfig() if welding.stitch is None or pieces_of(welding).on_m else welding.stitch.stitch(),
@@ -302,36 +300,6 @@ def _telling_of_the_arm(
         guess, kind = scenario.calibration.mounting_guess.pose(), scenario.calibration.refine
         return [pool[i] for i in informative_poses(chain_of(station.arm), guess, q, wanted, kind)]
     return planned(config, wanted)
-
-
-def check_scan_poses(scenario: Scenario) -> None:
-    """Check the scan poses of the workpiece, and that the pose of a scanner on the flange is known.
-
-    Raises:
-        InputError: one sentence that says what to change.
-    """
-    job, poses, scanner = scenario.job, scenario.planning.scan_poses_deg, scenario.scanner_config()
-    on_flange = scanner is not None and scanner.mounted_on == "flange"
-    if poses and not on_flange:
-        raise InputError(
-            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the"
-            " arm has one view: remove the list, or let the arm carry the scanner."
-        )
-    if on_flange and job.weld and (job.calibrate or job.X_FC is None):
-        nominal = scenario.calibration.mounting_guess
-        raise InputError(
-            "A weld with the scanner on the flange needs its pose there. Calibrate with the scenario eye_in_hand first."
-            f" Then write, with its numbers: job: {{calibrate: false, X_FC: {{xyz_m: {nominal.xyz_m}, rpy_deg:"
-            f" {nominal.rpy_deg}}}}}"
-        )
-    if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
-        raise InputError(
-            "planning.scan_poses_deg: several poses are for a part from a file; write one pose for a plate."
-        )
-    for k, pose in enumerate(poses):
-        if len(pose) != 6:
-            raise InputError(f"planning.scan_poses_deg[{k}] must hold 6 angles, not {len(pose)}.")
-        check_home(pose, scenario.arm, f"planning.scan_poses_deg[{k}]")
 
 
 def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
@@ -429,9 +397,6 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         minimum_scans=c.minimum_scans,
         maximum_scans=c.maximum_scans,
         p_BWork=work_point(scenario),
-        cost=c.cost,
-        work_radius_m=c.work_radius_mm * 1e-3,
-        cost_axes=tuple(c.cost_axes),
         correct_scanner=c.correct_scanner,
         refine=c.refine,
     )

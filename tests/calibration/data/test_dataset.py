@@ -11,8 +11,9 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.data.clouds import CloudError, read_cloud, save_cloud
-from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.errors import DatasetError
 
 HEADER = """\

@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
-from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 

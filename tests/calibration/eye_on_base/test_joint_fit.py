@@ -13,9 +13,8 @@ from scipy.stats import chi2
 from tests.worlds.wrong_models import calibrate_warped, new_errors
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base import joint_fit
-from weldcal.calibration.eye_on_base.estimate import with_scanner
+from weldcal.calibration.eye_on_base.estimate import corrected_observation, with_scanner
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors

@@ -12,10 +12,10 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
+from weldcal.calibration.flange.face import IN_MOTION
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.observation import observation_from_fit
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.motion.frames import IN_MOTION
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.calibration.published.costs import axes_cost, translation_and_rotation_cost
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
@@ -18,9 +19,6 @@ from weldcal.calibration.published.algorithm1 import (
     VerificationError,
     algorithm1_start,
     algorithm1_step,
-    axes_cost,
-    named_cost,
-    translation_and_rotation_cost,
     translation_cost,
 )
 from weldcal.models.errors import InputError
@@ -141,17 +139,3 @@ def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None
     assert np.array_equal(e[1], f[1], equal_nan=True)
     with pytest.raises(InputError, match="cannot be divided into 20 folds"):
         k_fold(observations, folds=20)
-
-
-def test_a_scenario_names_its_cost_and_the_axes_that_matter() -> None:
-    error = np.array([0.001, 0.0, 0.002, 3e-4, 4e-4, 12e-4])
-    assert named_cost("translation")(error) == pytest.approx(np.linalg.norm(error[3:]))
-    assert named_cost("work_radius", 0.2)(error) == pytest.approx(axes_cost((0, 1, 2, 3, 4, 5), 0.2)(error))
-    # section 4.2: pick and place with an end-effector that gives way along z
-    assert named_cost("work_radius", 0.2, ("x", "y"))(error) == pytest.approx(5e-4)
-    assert named_cost("work_radius", 0.5, ("yaw",))(error) == pytest.approx(1e-3)
-    assert named_cost("translation_and_rotation", 0.2)(error) == pytest.approx(
-        np.linalg.norm(error[3:]) + 0.2 * np.linalg.norm(error[:3])
-    )
-    with pytest.raises(InputError, match="translation, translation_and_rotation or work_radius, not 'money'"):
-        named_cost("money")

@@ -7,13 +7,13 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.flange.face import face_points
+from tests.calibration.published.costs import axes_cost
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     VerificationError,
     algorithm1_start,
     algorithm1_step,
-    axes_cost,
     translation_cost,
 )
 from weldcal.calibration.published.pipeline import (

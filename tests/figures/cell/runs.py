@@ -37,7 +37,7 @@ def cell(run: Run) -> None:
             scenario = known_camera(name)
             scenario.welding.seam_length_mm = run.size(30.0, None)
             options = RunOptions(scenario=name, out=run.out, seed=seed, recording=False)
-            welds.append(figures(measure(run_cell(build_cell(scenario, seed)), options), name, "guarded", seed))
+            welds.append(figures(measure(run_cell(build_cell(scenario, seed)), options), name, seed))
     header = ("", *(f"{weld.scenario} {weld.seed}" for weld in welds))
     run.table(
         "", header, ((what, *(fixed(getattr(w, key), k) for w in welds)) for what, (key, k) in WELD_FIGURES.items())

@@ -19,8 +19,7 @@ from tests.worlds.wrong_models import (
     study_station,
 )
 from weldcal.calibration.calibrate import PLAIN, Steps, calibrate
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, with_scanner
-from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, corrected_observation, with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.eye_on_base.validation import position_errors

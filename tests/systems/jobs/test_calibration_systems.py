@@ -67,7 +67,7 @@ def seen(k: int, error_m: float = 0.0, purpose: str = "calibrate") -> FlangeEsti
 def digested(count: int, error_m: float = 0.0, config: CalibratorConfig = CONFIG) -> CalibrationStatus:
     status = CalibrationStatus()
     for k in range(1, count + 1):
-        status = digest(status, seen(k, error_m), ring_pose(k), RING, config)
+        status = digest(status, seen(k, error_m), ring_pose(k), config)
     return status
 
 
@@ -205,20 +205,20 @@ def test_too_few_scans_say_so_and_promise_nothing() -> None:
 def test_a_scan_without_a_ring_is_refused_by_name_and_still_counts_as_one() -> None:
     status = digested(4)
     bad = FlangeEstimate(sequence=5, capture_time=0.5, purpose="calibrate", label="pose05", reason="no rim was seen")
-    status = digest(status, bad, ring_pose(5), RING, CONFIG)
+    status = digest(status, bad, ring_pose(5), CONFIG)
     assert status.refused == (("pose05", "no rim was seen"),)
     assert (status.sequence, status.calibration_scans, len(status.observations)) == (5, 5, 4)
     assert status.estimate is not None  # what was known before is kept
 
 
 def test_a_scan_of_an_unknown_arm_is_refused_by_name() -> None:
-    status = digest(CalibrationStatus(), seen(1), None, RING, CONFIG)
+    status = digest(CalibrationStatus(), seen(1), None, CONFIG)
     assert status.refused == (("pose01", "the arm's pose at the time of the scan is not known"),)
 
 
 def test_a_verification_scan_is_never_calibrated_with() -> None:
     before = digested(6)
-    after = digest(before, seen(7, purpose="verify"), ring_pose(7), RING, CONFIG)
+    after = digest(before, seen(7, purpose="verify"), ring_pose(7), CONFIG)
     assert after.observations == before.observations
     assert after.estimate is before.estimate
     assert after.calibration_scans == 6
@@ -243,25 +243,8 @@ def test_without_a_calibration_a_verification_is_infinitely_wrong() -> None:
     assert verify_at(CalibrationStatus(), seen(7), ring_pose(7)).error_m == np.inf
 
 
-def test_algorithm_1_runs_beside_it_once_its_cloud_was_seen(look: tuple[Scan, RigidTransform]) -> None:
-    assert digested(6).algorithm_1 is None
-    scan, X_BF = look
-    cloud = estimate_flange(scan, dc.replace(JOB, scan_purpose="verification_cloud"), X_BF, TOOL.X_FR, RING, X_BC, 0.06)
-    status = digest(CalibrationStatus(), dc.replace(cloud, sequence=0), X_BF @ TOOL.X_FR, RING, CONFIG)
-    assert status.verification_cloud is not None
-    assert (status.calibration_scans, status.observations) == (0, ())
-    for k in range(1, 6):
-        status = digest(status, seen(k, 0.1e-3), ring_pose(k), RING, CONFIG)
-    assert status.algorithm_1 is not None
-    assert len(status.algorithm_1.pool) == 4
-    assert status.algorithm_1.X_BC is not None
-    # Its figure is that of one ring seen by an ideal scanner with 1 mm pixels.
-    assert status.algorithm_1.cost < 1e-3
-    assert status.history[-1][3] == status.algorithm_1.cost
-
-
 def test_the_calibrator_takes_each_estimate_once() -> None:
-    system = IterativeCalibrator(the_arm(), RigidTransform(), RING, CONFIG)
+    system = IterativeCalibrator(the_arm(), RigidTransform(), CONFIG)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.GetInputPort("history").FixValue(

@@ -113,13 +113,10 @@ def in_phase(phase: str, **command: Any) -> World:
 
 def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     world = World()
-    assert world.look() == "move_to_verification_cloud"
-    assert world.arrive() == "scan_verification_cloud"
-    assert (world.command.scan_sequence, world.command.scan_purpose) == (1, "verification_cloud")
-    assert world.digest() == "move_to_pose"
+    assert world.look() == "move_to_pose"
     for k in range(6):
         assert world.arrive() == "scan_pose"
-        assert (world.command.scan_sequence, world.command.scan_purpose) == (k + 2, "calibrate")
+        assert (world.command.scan_sequence, world.command.scan_purpose) == (k + 1, "calibrate")
         assert world.digest(done=k == 5) == ("move_to_verify" if k == 5 else "move_to_pose")
     good = VerificationResult("pose08", 0.1e-3, 0.001)
     assert world.arrive() == "scan_verify"
@@ -291,7 +288,7 @@ def test_an_arm_that_stands_elsewhere_goes_home_first(calibrate: bool) -> None:
     assert (world.command.mode, world.command.process_on) == ("move", False)
     assert world.command.q_goal is Q_HOME
     before = world.command.goal_id
-    assert world.arrive() == ("move_to_verification_cloud" if calibrate else "park")
+    assert world.arrive() == ("move_to_pose" if calibrate else "park")
     assert world.command.goal_id == before + 1
 
 
@@ -360,9 +357,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "the operator's wish": ("weld", 0.1, {"hold": True}, "The operator ended the job in phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
-    "cloud pose not reached": ("move_to_verification_cloud", 21.0, {}, "did not come to rest at its goal within 20 s"),
     "unseen pose not reached": ("move_to_verify", 21.0, {}, "did not come to rest at its goal within 20 s"),
-    "no cloud": ("scan_verification_cloud", 9.0, {}, "No scan arrived within 8 s"),
     "no scan": ("scan_pose", 9.0, {}, "No scan arrived within 8 s"),
     "no verification scan": ("scan_verify", 9.0, {}, "No scan arrived within 8 s"),
     "no workpiece scan": ("scan_workpiece", 9.0, {}, "No workpiece scan arrived within 8 s"),
@@ -516,9 +511,7 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
 def test_the_progress_told_of_a_run_never_falls_from_phase_to_phase() -> None:
     told = [SHARES[phase] for phase in PHASES if phase in SHARES]
     assert told == sorted(told)
-    assert set(PHASES) - set(SHARES) == {"move_to_verification_cloud", "scan_verification_cloud", "scan_pose"}, (
-        "these and move_to_pose are told by the number of scans"
-    )
+    assert set(PHASES) - set(SHARES) == {"scan_pose"}, "these and move_to_pose are told by the number of scans"
 
 
 def test_a_scanner_that_moved_holds_the_job_before_the_weld_and_warns_during_it() -> None:

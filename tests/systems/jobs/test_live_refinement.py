@@ -13,8 +13,8 @@ from pydrake.math import RigidTransform
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, scenario
 from tests.worlds.wrong_models import WrongArmStation, station
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.calibration.refinement.kinematics_choice import kinematics_text

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite, write_bag

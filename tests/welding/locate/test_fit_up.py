@@ -17,15 +17,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.drawing import draw_seam
 from weldcal.models.workpieces.seams import DrawnSeam
-from weldcal.welding.locate.part.joint import (
-    FIT_UP,
-    FitUp,
-    FitUpOutside,
-    _opening,
-    check_fit_up,
-    measure_fit_up,
-    read_limits,
-)
+from weldcal.welding.locate.part.fit_up import FIT_UP, FitUp, FitUpOutside, check_fit_up, read_limits
+from weldcal.welding.locate.part.joint import _opening, measure_fit_up
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.planes import into
 from weldcal.welding.locate.planning import _about_seam

@@ -4,16 +4,15 @@ tool."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.worlds.weld.laws import get_law, motion_law
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.servo.guards import seam_conditioning
-from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import MotionLimits, ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.track import TickMotion, TorchTarget
@@ -48,9 +47,8 @@ def moved(name: str, p_tip: Array, alpha: float, psi_tip: float, psi_torch: floa
     t = direction(psi_torch)
     n = np.cross(UP, t)
     target = TorchTarget(point=torch - offset * n, tangent=t, normal=n, up=UP, arc=0.0, s=0.0, residual=np.zeros(2))
-    config = replace(CONFIG, law=name)
     return motion_law(get_law(name))(
-        WeldingState(), tool(p_tip, alpha), seam_at(p_tip, psi_tip), target, (0.0, 0.0), config, config.period_s
+        WeldingState(), tool(p_tip, alpha), seam_at(p_tip, psi_tip), target, (0.0, 0.0), CONFIG, CONFIG.period_s
     )
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from tests.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
 from tests.worlds.weld.case import RunMetrics, WeldCase, judge, study_config
+from tests.worlds.weld.laws import LAWS, UnknownLaw, get_law, literal_tangent, steering
 from tests.worlds.weld.plant import simulate
 from tests.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo.laws import LAWS, UnknownLaw, get_law, literal_tangent
 
 STRAIGHT = arcs((0.10, 0.0), spacing=2e-3)
 CORNER = corner(0.020, 90.0, 1.0, legs=0.07)
@@ -21,7 +21,8 @@ BEND = arcs((0.03, 0.0), (0.06, 1.0 / 0.06), spacing=2e-3)
 def welded(points: Array, law: str, budget: Budget = NOMINAL) -> RunMetrics:
     """One short weld under a law, as in the study."""
     case = WeldCase("short", law=law)
-    run = simulate(TrueSeam("short", points, np.array([0.0, 0.0, 1.0])), budget, study_config(case), 0)
+    with steering(law):
+        run = simulate(TrueSeam("short", points, np.array([0.0, 0.0, 1.0])), budget, study_config(case), 0)
     return judge(run, case.speed_m_s, case.chord_m)
 
 

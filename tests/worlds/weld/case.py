@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.worlds.weld.budgets import BUDGETS, Budget
+from tests.worlds.weld.laws import steering
 from tests.worlds.weld.plant import PHASES, StudyRun, simulate
 from tests.worlds.weld.seams import get_seam
 from weldcal.tools.report.demo import DemoResult
@@ -201,7 +202,6 @@ def study_config(case: WeldCase) -> ServoConfig:
         tool=ToolGeometry(torch_offset_m=case.chord_m),
         touch=TouchOnConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
         weld_speed_m_s=case.speed_m_s,
-        law=case.law,
     )
     if case.law == "guarded":
         return config
@@ -211,12 +211,14 @@ def study_config(case: WeldCase) -> ServoConfig:
         torch=replace(config.torch, ignition_error_m=1.0),
         faults=replace(config.faults, torch_error_m=1.0),
         windows=open_wide,
+        touch=replace(config.touch, feel_start=False),
     )
 
 
 def run_case(case: WeldCase, seed: int) -> tuple[StudyRun, RunMetrics]:
     """One weld and its figures."""
-    run = simulate(get_seam(case.seam), case.errors, study_config(case), seed, case.gaps)
+    with steering(case.law):
+        run = simulate(get_seam(case.seam), case.errors, study_config(case), seed, case.gaps)
     return run, judge(run, case.speed_m_s, case.chord_m, case.gaps)
 
 
@@ -230,7 +232,6 @@ class CellRun:
     """
 
     scenario: str
-    law: str
     seed: int
     completed: bool
     reason: str
@@ -245,15 +246,14 @@ class CellRun:
     real_time_factor: float = np.nan
 
 
-def figures(result: DemoResult, name: str, law: str, seed: int) -> CellRun:
+def figures(result: DemoResult, name: str, seed: int) -> CellRun:
     """Return the figures of a finished run, in mm."""
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
     if weld is None or weld.error is None or felt is None or result.record is None:
-        return CellRun(scenario=name, law=law, seed=seed, completed=False, reason=run.reason or "nothing was welded")
+        return CellRun(scenario=name, seed=seed, completed=False, reason=run.reason or "nothing was welded")
     return CellRun(
         scenario=name,
-        law=law,
         seed=seed,
         completed=not run.held,
         reason=run.reason or "",

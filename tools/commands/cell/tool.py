@@ -10,9 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader, PoseForm
 from weldcal.calibration.data.results import load_result
+from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.tool.comparison import (
     EXCEEDED,
     HOLDS,

@@ -9,8 +9,9 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, fit_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange

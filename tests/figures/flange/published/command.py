@@ -15,8 +15,8 @@ from tests.figures.flange.published.simulation import simulate
 from tests.figures.harness import Run, figure
 from tests.worlds.flange_frames import P_FS, SphereScan, cell_scans
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.observation import Observation

@@ -1,21 +1,29 @@
-"""The steering laws by name: the paper's as printed, its corrections step by step, and the guarded law."""
+"""The steering laws by name: the paper's as printed, its corrections step by step, and the guarded law.
+
+The product has the guarded law alone; `steering` puts one of the paper's in its place, for the comparison.
+"""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
-from weldcal.welding.numerics import Array, clip, cross, dot, unit
+from weldcal.welding.numerics import Array, changed, clip, cross, dot, unit
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.refinement import RefinedSeam
+from weldcal.welding.servo import contact, step
 from weldcal.welding.servo.guards import seam_conditioning
 from weldcal.welding.servo.settings import ServoConfig
-from weldcal.welding.servo.state import WeldingState
+from weldcal.welding.servo.state import Phase, WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.servo.track import TickMotion, TorchTarget, guarded_motion
 
@@ -35,7 +43,7 @@ class SteeringLaw:
     """One steering law and how it differs from the paper's.
 
     Attributes:
-        name: as in ServoConfig.law; summary: what it is, for tables.
+        name: of LAWS; summary: what it is, for tables.
         guarded: the law with phases for gaps and ends, which the paper's does not have.
         sign: of omega; -1 as printed. fitted: normal from a local fit, else from the two points beside the nearest.
         feedback: whether the torch's offset is fed back.
@@ -135,3 +143,42 @@ def literal_tangent(seam: RefinedSeam, p_torch: Array, otherwise: Array) -> Arra
     i = int(np.argmin(np.sum((seam.points - p_torch) ** 2, axis=1)))
     i = min(max(i, 1), len(seam) - 2)
     return unit(seam.points[i + 1] - seam.points[i - 1], otherwise)
+
+
+@contextmanager
+def steering(name: str) -> Iterator[None]:
+    """Let the servo steer by the law of that name during the block.
+
+    The paper appends every point, uses the plan's frame alone and detects neither contact nor the seam's end; the
+    wanted deflection without contact is an interpretation.
+    """
+    law, lost, end = get_law(name), False, math.nan
+    contacts, servo = step._contact, step._servo
+
+    def every_point(before: WeldingState, state: WeldingState, config: ServoConfig) -> WeldingState:
+        nonlocal lost, end
+        if state.phase != Phase.TRACK:
+            return contacts(before, state, config)
+        lost, end = contact.contact_lost(before, state, config), state.s_end
+        return contact.with_point(state, config)
+
+    def seeking(state: WeldingState, off: Array, sample: Any, config: ServoConfig) -> tuple[float, float]:
+        lateral, upward = servo(state, off, sample, config)
+        if state.phase != Phase.TRACK or not lost:
+            return lateral, upward
+        deflection, fresh = config.deflection, contact.freshness(state, sample.time)
+        seek = 0.0 if law.lost == "zeroed" else deflection.delta_d_m
+        return fresh * deflection.k_p * (seek - state.delta_n), 0.0
+
+    with ExitStack() as stack:
+        if not law.guarded:
+            for module, replaced, by in (
+                (step, "guarded_motion", motion_law(law)),
+                (step, "_contact", every_point),
+                (step, "_servo", seeking),
+                (step, "finish", lambda state: changed(state, s_end=end)),
+                (contact, "felt_turn", lambda *_: 0.0),
+                (contact, "_steering", lambda *_: 0.0),
+            ):
+                stack.enter_context(patch.object(module, replaced, by))
+        yield
