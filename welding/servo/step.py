@@ -368,7 +368,7 @@ def _moved(
 def _torch_problem(
     state: WeldingState, sample: ServoSample, target: TorchTarget, error: tuple[float, float], config: ServoConfig
 ) -> tuple[WeldingState, str | None]:
-    """The state with the torch's progress; a sentence where it does not advance, is too far off or leaves its angles."""
+    """The state with the torch's progress; a sentence where it stands, is too far off or leaves its angles."""
     state, problem = advance(state, target.s, sample.time, config)
     problem = problem or angles(sample, target, config)
     off_m = math.hypot(*error)
@@ -381,7 +381,7 @@ def _arc_step(
     state: WeldingState,
     now: float,
     s: float,
-    v_torch: Array,
+    v_torch: float,
     error: tuple[float, float],
     problem: str | None,
     config: ServoConfig,

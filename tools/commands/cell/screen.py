@@ -135,8 +135,8 @@ def side_of(edge: PartEdge) -> str:
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     """Sort a part's joints as a welder would: those that the tool can weld first, then the nearest misses.
 
-    Purchased parts come after all of them; plates of unlike thickness after the others of their kind. The felt and the upward ones come first, then
-    those with the largest length times thinner plate. The arm is not asked.
+    Purchased parts come after all of them; plates of unlike thickness after the others of their kind. The felt and the
+    upward ones come first, then those with the largest length times thinner plate. The arm is not asked.
 
     Of a part without joints, as a mesh of other surfaces, its concave edges are taken.
     """

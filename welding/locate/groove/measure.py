@@ -263,7 +263,7 @@ def _line_sigma(
     width: float,
     ends: tuple[float, float],
 ) -> Floats:
-    """Return the line's sigma (N,) m at arc lengths (N,): of its sections, over gaps, of one wall, at ends, at corners."""
+    """Return the line's sigma (N,) m at arc lengths (N,): of sections, over gaps, of one wall, at ends and corners."""
     pitch = groove.pitch_m
     for a, b in gaps:
         hidden = (at > a) & (at < b)
