@@ -51,7 +51,9 @@ def make_world(seed: int, *, alike: bool = False) -> DoctorWorld:
     true = wrong_arm(believed, rng.normal(size=(6, 6)) * np.repeat([4e-5, 2e-4], 3))
     zeros = np.radians(rng.normal(0.0, 0.02, believed.n))
     home = HOME + rng.normal(0.0, 0.1, 6)
-    faced = pose(exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.normal(0.0, 0.1, 3)), [0.0, 0.0, 0.62])
+    faced = pose(
+        exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.normal(0.0, 0.1, 3)), np.array([0.0, 0.0, 0.62])
+    )
     X_BC = chain_poses(believed, home[None])[0] @ faced
     guess = X_BC @ pose(exp_rotation(rng.normal(0.0, 0.01, 3)), rng.normal(0.0, 0.008, 3))
     sigma = np.array([1.5e-3, *(6e-3,) * 2, *(8e-3,) * 3, *(0.02,) * 2])
