@@ -68,7 +68,7 @@ def study(run: Run, names: tuple[str, ...]) -> None:
         run.table(
             "Comparison of the laws",
             LAW_HEADER,
-            compared_lines(run_cases(COMPARED, seeds[:3], keep, run.progress, runs)),
+            compared_lines(run_cases(run.size(COMPARED[:12], COMPARED), seeds[:3], keep, run.progress, runs)),
         )
     run.write("runs.csv", runs_csv(runs))
     for case, weld in pictured.values():
