@@ -17,6 +17,7 @@ from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.solve import HandEyeResult, as_poses
+from weldcal.calibration.recorded_hand_eye import solve_arrays
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.cell import Cell
@@ -26,7 +27,6 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import run_procedure
-from weldcal.tools.commands.hand_eye import solve_arrays
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
 from weldcal.tools.report.calibration import CalibrationReport

@@ -22,11 +22,11 @@ from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
+from weldcal.calibration.recorded_hand_eye import solve_pairs
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.commands.hand_eye import solve_pairs
 
 KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera", "far target")
 """What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of

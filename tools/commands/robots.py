@@ -248,5 +248,6 @@ def emulate_ur(
     lockstep: Annotated[float, option("--lockstep", "S", "Seconds for which time waits for a late client.")] = 0.0,
 ) -> None:
     """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
-    settings = {name: value for name, value in locals().items() if name != "call"}
-    run_emulator(**settings, seed=call.seed, ready=typer.echo)
+    controller = partial(run_emulator, polyscope=polyscope, robot=robot, kinematics=kinematics, q=q, seed=call.seed)
+    controller = partial(controller, safety_limits=safety_limits, operational_mode=operational_mode)
+    controller(host=host, control_port=control_port, pace=pace, lockstep=lockstep, ready=typer.echo)

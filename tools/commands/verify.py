@@ -21,6 +21,7 @@ from weldcal.calibration.eye_on_base.validation import offset_from, position_err
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.recorded_hand_eye import stated_forms
 from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
@@ -37,7 +38,6 @@ from weldcal.tools.commands.hand_eye import (
     RobotFormOption,
     RobotPosesOption,
     UnitOption,
-    stated_forms,
 )
 from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
 from weldcal.tools.console import Progress

@@ -19,9 +19,10 @@ from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.sets import read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.recorded_hand_eye import problem_of_pairs
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic
-from weldcal.tools.commands.hand_eye import digest, problem_of_pairs
+from weldcal.tools.commands.hand_eye import digest
 from weldcal.tools.console import plain
 from weldcal.tools.report.verify_pairs import PairsReport, verify_pairs_report
 

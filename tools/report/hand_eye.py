@@ -2,7 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,7 @@ from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.pairs.importing import BY_MOTION
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import CameraScale, HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.motion.pose_streams import ClockOffset
-from weldcal.calibration.planning.next_pose import NextPose
+from weldcal.calibration.recorded_hand_eye import RecordedHandEye
 from weldcal.models.arrays import Array
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, limit_tolerance
 from weldcal.tools.report.pictures import error_bars
@@ -22,37 +21,14 @@ from weldcal.tools.report.render import fixed, render
 Table = tuple[str, list[tuple[str, str, str]]]
 
 
-@dataclass(frozen=True)
-class MethodRow:
-    """One line of the comparison: a method and its held-out errors; NaN where it gave no answer on some fold."""
-
-    method: str
-    deg: float
-    mm: float
-
-
 @dataclass(frozen=True, kw_only=True)
-class HandEyeReport:
-    """A finished calibration: the result, the comparison, the next pose (``advice``) and the files.
+class HandEyeReport(RecordedHandEye):
+    """A finished calibration, with its files."""
 
-    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were
-    given.
-    """
-
-    result: HandEyeResult
-    mounting: Mounting
-    comparison: tuple[MethodRow, ...]
-    next_pose: NextPose | None
     files: tuple[Path, ...]
     seconds: float
-    corners: str = ""
-    advice: str = ""
-    streams: ClockOffset | None = None
     limit_mm: float | None = None
     folder: Path | None = None
-    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
-    read_notes: tuple[str, ...] = ()
-    pictures: PictureResult | None = None
 
     @property
     def first(self) -> FirstScreen:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.poses import co_manipulation, eye_in_hand
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions
 from weldcal.tools.commands.hand_eye import run_hand_eye
 from weldcal.tools.report.hand_eye import HandEyeReport
 
@@ -29,7 +30,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[HandEyeReport, Pa
     folder = tmp_path_factory.mktemp("hand_eye")
     F, G, _, _ = eye_in_hand(10, np.random.default_rng(3), np.radians(0.05), 2e-4)
     np.savez(folder / "a.npz", A=F, B=G, mode="eye_in_hand")
-    return run_hand_eye("ax-yb", folder / "a.npz", folder / "out"), folder / "out"
+    return run_hand_eye(folder / "a.npz", folder / "out", HandEyeOptions()), folder / "out"
 
 
 def same(found: RigidTransform, X: RigidTransform) -> None:

@@ -16,6 +16,7 @@ from weldcal.calibration.hand_eye.opencv_methods import opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.starts import motions
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.hand_eye import run_hand_eye
 
@@ -146,11 +147,11 @@ def test_one_mistake_is_recognised(wrong: str, sentence: str, tmp_path: Path, po
         G[:, :3, 3] /= 0.0285
     np.savez(tmp_path / "a.npz", A=F, B=G, mode="eye_in_hand")
     with pytest.raises(InconsistentPoses, match=sentence):
-        run_hand_eye("ax-yb", tmp_path / "a.npz", tmp_path)
+        run_hand_eye(tmp_path / "a.npz", tmp_path, HandEyeOptions())
 
 
 def test_the_command_writes_what_other_programs_read(tmp_path: Path, poses: tuple[Array, Array]) -> None:
-    report = run_hand_eye("ax-yb", write("npz", tmp_path, *poses), tmp_path / "out")
+    report = run_hand_eye(write("npz", tmp_path, *poses), tmp_path / "out", HandEyeOptions())
     names = {p.name for p in report.files}
     assert {"hand_eye.yaml", "hand_eye.json", "X_FC.urdf.xacro", "X_FC.drake.yaml", "X_BM.static_transform.sh"} <= names
     saved = json.loads((tmp_path / "out" / "hand_eye.json").read_text())
@@ -167,8 +168,8 @@ def test_two_robots_want_their_own_equation(tmp_path: Path) -> None:
     path = tmp_path / "two.npz"
     np.savez(path, A=A, B=B, C=C)
     with pytest.raises(InputError, match="hand-eye axb-ycz"):
-        run_hand_eye("ax-yb", path, tmp_path)
-    report = run_hand_eye("axb-ycz", path, tmp_path)
+        run_hand_eye(path, tmp_path, HandEyeOptions())
+    report = run_hand_eye(path, tmp_path, HandEyeOptions(equation="axb-ycz"))
     assert set(report.result.poses) == {"X", "Y", "Z"}
     assert report.summary()["Y_is"] == "pose of the second robot's base in the first robot's base frame: X_BD"
 
@@ -221,7 +222,7 @@ def test_a_word_of_an_npz_may_be_bytes_or_an_array(tmp_path: Path, poses: tuple[
 def test_samples_that_repeat_others_are_named(tmp_path: Path, poses: tuple[Array, Array]) -> None:
     F, G = poses
     path = write("npz", tmp_path, np.concatenate([F, F[:3]]), np.concatenate([G, G[:3]]))
-    report = run_hand_eye("ax-yb", path, tmp_path / "out")
+    report = run_hand_eye(path, tmp_path / "out", HandEyeOptions())
     assert any(text.startswith("The 15 samples repeat 12 poses") for text in report.first.notes)
 
 
@@ -232,10 +233,10 @@ def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, pos
     for count, sentence in ((len(F), "only 4 corners"), (len(F) - 1, "it must be")):
         path = tmp_path / "marker.npz"
         np.savez(path, A=F, B=G, mode="eye_in_hand", img=np.ones((count, 4, 2)), **seen)
-        report = run_hand_eye("ax-yb", path, tmp_path / "out", corners=None)
+        report = run_hand_eye(path, tmp_path / "out", HandEyeOptions(corners=None))
         assert sentence in report.corners
         with pytest.raises(DatasetError, match=sentence):
-            run_hand_eye("ax-yb", path, tmp_path / "out", corners=True)
+            run_hand_eye(path, tmp_path / "out", HandEyeOptions(corners=True))
 
 
 def test_ragged_and_impossible_numbers_are_named(tmp_path: Path, poses: tuple[Array, Array]) -> None:

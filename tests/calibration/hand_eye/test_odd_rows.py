@@ -10,7 +10,7 @@ from tests.calibration.hand_eye.poses import Array, eye_in_hand, random_poses
 from weldcal.calibration.geometry.se3 import inverse
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult
-from weldcal.tools.commands.hand_eye import solve_pairs
+from weldcal.calibration.recorded_hand_eye import solve_pairs
 
 TURN, SHIFT = float(np.radians(0.05)), 3e-4
 QUICK = HandEyeConfig(folds=0)

@@ -11,6 +11,7 @@ from tests.calibration.hand_eye.scale_sets import QUICK, independent_sigma, name
 from weldcal.calibration.hand_eye.mistakes import _scale_fit, wrong_scale
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import solve_ax_xb, solve_problem
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions
 from weldcal.tools.commands.hand_eye import run_hand_eye
 
 
@@ -71,7 +72,7 @@ def test_motions_name_the_scale_as_well() -> None:
 def test_the_first_screen_names_a_wrong_scale_first(tmp_path: Path) -> None:
     F, G, _ = pairs(np.random.default_rng(3), 12, 1.0 / 0.97, 0.05, 0.3)
     np.savez(tmp_path / "pairs.npz", A=F, B=G, mode="eye_in_hand")
-    first = run_hand_eye("ax-yb", tmp_path / "pairs.npz", tmp_path / "out", limit_mm=1.0).first
+    first = run_hand_eye(tmp_path / "pairs.npz", tmp_path / "out", HandEyeOptions(), limit_mm=1.0).first
     assert first.concerns[0].startswith("The camera's distances seem")
     assert first.next.text.startswith("Correct the target's stated size")
 
@@ -80,5 +81,5 @@ def test_the_first_screen_states_another_order_and_unit(tmp_path: Path) -> None:
     F, G, _ = pairs(np.random.default_rng(3), 12, 1.0, 0.05, 0.3)
     G[:, :3, 3] *= 1000.0 / 25.4
     np.savez(tmp_path / "pairs.npz", A=F, B=np.roll(G, 5, axis=0)[::-1], mode="eye_in_hand")
-    first = run_hand_eye("ax-yb", tmp_path / "pairs.npz", tmp_path / "out").first
+    first = run_hand_eye(tmp_path / "pairs.npz", tmp_path / "out", HandEyeOptions()).first
     assert first.more["read as"] == "camera positions in inch; rows paired by their motions (-v: the order)"

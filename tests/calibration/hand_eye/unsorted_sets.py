@@ -20,9 +20,9 @@ from weldcal.calibration.data.poses.listing import listing_of_array
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms, import_pairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig
+from weldcal.calibration.recorded_hand_eye import solve_pairs
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.commands.hand_eye import solve_pairs
 
 KINDS = ("shuffled", "reversed", "missing", "missing, shuffled", "extra", "home at both ends", "both incomplete")
 

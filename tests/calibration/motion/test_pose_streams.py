@@ -13,6 +13,7 @@ from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.motion.pose_streams import PoseStreams, is_stream_file, read_streams, synchronise
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions
 from weldcal.models.arrays import Array
 from weldcal.tools.commands.hand_eye import run_hand_eye
 
@@ -68,7 +69,7 @@ def test_sigma_is_honest() -> None:
 def test_command(tmp_path: Path) -> None:
     file = written(tmp_path, streams(0.025, epoch_s=100.0, seconds=6.0))
     assert is_stream_file(file)
-    summary = run_hand_eye("ax-yb", file, tmp_path / "out").summary()
+    summary = run_hand_eye(file, tmp_path / "out", HandEyeOptions()).summary()
     assert summary["clock_offset_ms"] == pytest.approx(25.0, abs=1.0)
     assert 0.0 < float(str(summary["clock_offset_sigma_ms"])) < 1.0
 
@@ -101,7 +102,7 @@ def test_a_short_hole_in_a_stream_is_left_out(tmp_path: Path) -> None:
     s = streams(0.0371)
     keep = (s.hand_time < 8.0) | (s.hand_time > 8.12)
     file = written(tmp_path, PoseStreams(s.hand_time[keep], s.hand[keep], s.eye_time, s.eye))
-    report = run_hand_eye("ax-yb", file, tmp_path / "out", mounting="eye_in_hand")
+    report = run_hand_eye(file, tmp_path / "out", HandEyeOptions(mounting="eye_in_hand"))
     assert report.streams is not None
     assert abs(report.streams.offset_s - 0.0371) < 4.0 * report.streams.sigma_s
 
@@ -115,7 +116,7 @@ def test_trajectories_of_other_length_and_clock(tmp_path: Path, inverted: bool) 
         q = Rotation.from_matrix(P[:, :3, :3]).as_quat()
         rows = [f"{a:.6f} " + " ".join(f"{v:.7f}" for v in (*p, *r)) for a, p, r in zip(t, P[:, :3, 3], q, strict=True)]
         (folder / f"{name}.tum").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
-    report = run_hand_eye("ax-yb", folder, tmp_path / "out", mounting="eye_in_hand")
+    report = run_hand_eye(folder, tmp_path / "out", HandEyeOptions(mounting="eye_in_hand"))
     assert report.streams is not None
     assert abs(report.streams.offset_s + 0.213) < 4.0 * report.streams.sigma_s
     assert np.abs(report.streams.X - X).max() < 2e-3

@@ -25,13 +25,14 @@ from weldcal.calibration.motion.drift.sequential import MOVED, DriftEvent
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
-from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
+from weldcal.tools.report.hand_eye import HandEyeReport, hand_eye_report
 from weldcal.tools.report.monitor import MonitorReport, monitor_page
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.mounting import MountingReport, mounting_report
