@@ -344,11 +344,10 @@ def _moved(
     state: WeldingState, sample: ServoSample, seam: SeamFrame, off: Array, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, TorchTarget, TickMotion, tuple[float, float]]:
     """The motion of this tick, the torch's target, and what the wire is off it: m to the left and up."""
-    assert state.plan_fit is not None
-    curve = state.plan_fit.curve
+    assert (fit := state.plan_fit) is not None
     state = _slewed(state, *_servo(state, off, sample, config), config, dt)
     p_BW = np.asarray(sample.X_BT.translation()) + sample.X_BT.rotation().matrix() @ config.p_TW
-    target = torch_target(state, curve, p_BW, config)
+    target = torch_target(state, fit.curve, p_BW, config)
     if state.torch_on and config.weave.amplitude_m > 0.0:
         state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
     motion = guarded_motion(

@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.figures.profiler.frustum import fit_frustum, without_spikes
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint

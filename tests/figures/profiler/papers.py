@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.optimize import least_squares
 
+from tests.figures.profiler.frustum import fit_frustum, without_spikes
 from tests.worlds.edge_trials import TRANSLATIONS, EdgeTrial
 from tests.worlds.profiler import WorldData
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from tests.figures.harness import Run, figure
+from tests.figures.profiler.frustum import fit_frustum
 from tests.figures.profiler.papers import (
     SPHERE_METHODS,
     TARGETS,
@@ -27,7 +28,6 @@ from tests.figures.profiler.papers import (
 from tests.worlds.edge_trials import fixed_edge_trials, made_edge_trials, rms
 from tests.worlds.profiler import MM, WorldData, fixed_worlds, made_worlds
 from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
-from weldcal.calibration.profiler.features.frustum import fit_frustum
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint

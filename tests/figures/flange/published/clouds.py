@@ -7,6 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from tests.figures.flange.published.pipeline import (
+    PublishedVerification,
+    all_pairs,
+    find_centres,
+    published_model,
+    published_pairs,
+    search_circle,
+)
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import corrected_observation
@@ -25,14 +33,6 @@ from weldcal.calibration.published.algorithm1 import (
     icp_error,
     make_verification,
     sight,
-)
-from weldcal.calibration.published.pipeline import (
-    PublishedVerification,
-    all_pairs,
-    find_centres,
-    published_model,
-    published_pairs,
-    search_circle,
 )
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

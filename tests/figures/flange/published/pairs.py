@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.figures.flange.published.pipeline import all_pairs
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import fit_rigid_sets
-from weldcal.calibration.published.pipeline import all_pairs
 from weldcal.models.arrays import Array
 
 RUNS_FILE = "paper_algorithm1_50_runs.npz"

@@ -8,15 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.flange.face import face_points
 from tests.calibration.published.costs import axes_cost
-from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import (
-    VerificationError,
-    algorithm1_start,
-    algorithm1_step,
-    translation_cost,
-)
-from weldcal.calibration.published.pipeline import (
+from tests.figures.flange.published.pipeline import (
     CircleParameters,
     PublishedParameters,
     PublishedVerification,
@@ -26,6 +18,14 @@ from weldcal.calibration.published.pipeline import (
     published_model,
     published_pairs,
     search_circle,
+)
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.published.algorithm1 import (
+    VerificationError,
+    algorithm1_start,
+    algorithm1_step,
+    translation_cost,
 )
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
