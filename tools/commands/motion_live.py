@@ -18,7 +18,8 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_result, motion_screen
-from weldcal.tools.report.render import render, statistics, write_atomic
+from weldcal.tools.report.page import Rows, page_html
+from weldcal.tools.report.render import statistics, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
 
@@ -174,12 +175,13 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
         stream, scanner = posed_stream(record, finished.cell.station.arm), scenario.scanner_config()
         assert scanner is not None
         added.recorder.finish(stream, scenario.arm, scenario.flange_name(), scanner.scanner())
-    page = render(
-        "motion_live.html.j2",
+    rows = [(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v]
+    page = page_html(
+        f"Calibration in motion, live, in “{options.scenario}”",
+        scenario.description,
+        [("Figures", [Rows(rows, text=(0, 1))])],
         first=outcome.first,
-        scenario=options.scenario,
-        description=scenario.description,
-        rows=[(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v],
+        facts=[("scenario", "scenario.yaml beside this report")],
         recording=finished.meshcat is not None,
         **robot_timing(finished.run),
     )

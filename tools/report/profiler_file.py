@@ -22,8 +22,9 @@ from weldcal.tools.report.first_screen import (
     radius_95,
     typed,
 )
+from weldcal.tools.report.page import Bullets, Facts, Rows, Section, Shot, page_html
 from weldcal.tools.report.pictures import OURS, error_bars, subplots, svg
-from weldcal.tools.report.render import fixed, render, sigma_rows
+from weldcal.tools.report.render import fixed, sigma_rows
 
 _NAMES = {
     "scans": ("scans", ""),
@@ -179,46 +180,49 @@ def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:
 
 def profiler_report(made: ProfilerFile) -> str:
     """Return the page of a calibration from a file, as one self-contained HTML text."""
-    held = made.held_out_mm
-    judged = bool(np.isfinite(held).any())
-    return render(
-        "profiler_file.html.j2",
-        first=made.first,
-        title=f"Profiler calibration from {made.source}",
-        subtitle=f"Method: {made.record.method}.",
-        bars=(
-            error_bars([str(k) for k in range(len(held))], held, np.ones(len(held), bool), "left-out scan, mm")
-            if judged
-            else None
-        ),
-        of="scans",
-        seen=_seen(made.points),
-        seam=None,
-        rows=_rows(made.found),
-        sigma=[] if made.record.covariance is None else sigma_rows(made.record.covariance),
-        warnings=list(made.found.get("warnings", ())),
-        lists=_lists(made.found),
-        digest=made.record.data_sha256,
+    record = made.record
+    pictures = (
+        left_out("scans", "scan", [str(k) for k in range(len(made.held_out_mm))], made.held_out_mm),
+        ("Where it was measured", [Shot(_seen(made.points), SEEN, "Measured points in the scan plane")]),
     )
+    sigma = [] if record.covariance is None else sigma_rows(record.covariance)
+    facts = [("SHA-256 of the file", record.data_sha256)] if record.data_sha256 else []
+    title, subtitle = f"Profiler calibration from {made.source}", f"Method: {record.method}."
+    return page_html(title, subtitle, _sections(made.found, pictures, sigma), first=made.first, facts=facts)
+
+
+SEEN = (
+    "Profile points in the scan plane, with their middle. The error at the top of this page is that of a point there."
+)
+ROOT = "One point for each profile that shows the groove. seam.csv holds root and both edges."
 
 
 def seam_report(seam: ProfilerSeam) -> str:
     """Return the page of a mapped seam, as one self-contained HTML text."""
-    return render(
-        "profiler_file.html.j2",
-        first=seam.first,
-        title=f"Seam mapped from {seam.source}",
-        subtitle=f"In the robot's base, by the calibration {seam.calibration}.",
-        bars=None,
-        of="scans",
-        seen=None,
-        seam=_line(seam.root_mm),
-        rows=_rows(seam.found),
-        sigma=[],
-        warnings=list(seam.found.get("warnings", ())),
-        lists=_lists(seam.found),
-        digest="",
-    )
+    picture = Shot(_line(seam.root_mm), ROOT, "Root of the groove from above and from the side")
+    sections = _sections(seam.found, [("The groove's root in the base", [picture])], [])
+    subtitle = f"In the robot's base, by the calibration {seam.calibration}."
+    return page_html(f"Seam mapped from {seam.source}", subtitle, sections, first=seam.first)
+
+
+def left_out(of: str, one: str, ids: list[str], held_mm: Array) -> Section:
+    """Return the section of what was left out in turn, by its errors (n,) mm; it is empty where none is known."""
+    known = np.isfinite(held_mm).any()
+    bars = error_bars(ids, held_mm, np.ones(len(ids), bool), f"left-out {one}, mm") if known else None
+    alt = f"Bar chart of errors of {of} that were left out"
+    shot = Shot(bars, "Error of each under a calibration that did not use it.", alt)
+    return f"{of.capitalize()} that were left out", [shot]
+
+
+def _sections(
+    found: Mapping[str, Any], pictures: Sequence[Section], sigma: Sequence[tuple[str, object]]
+) -> list[Section]:
+    lists = Facts(_lists(found), "Scans that were not used, by number")
+    return [
+        ("Warnings", [Bullets(found.get("warnings", ()))]),
+        *pictures,
+        ("Figures", [Rows(_rows(found), text=(0, 1)), Facts(sigma), lists]),
+    ]
 
 
 def _rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -59,7 +59,7 @@ class RunOptions:
     replace: Mapping[str, Replacement] | None = None
 
 
-def robot_timing(run: Run[Any]) -> dict[str, object]:
+def robot_timing(run: Run[Any]) -> dict[str, Any]:
     """What `base.html.j2` shows of the run's timing, as the context `robot_timing`; empty without a robot's clock."""
     clock = run.clock
     if clock is None or not sum(clock.lateness.counts):

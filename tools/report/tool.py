@@ -35,8 +35,8 @@ from weldcal.tools.report.first_screen import (
     expected_error,
     limit_tolerance,
 )
+from weldcal.tools.report.page import Rows, Shot, page_html
 from weldcal.tools.report.pictures import subplots
-from weldcal.tools.report.render import render
 from weldcal.welding.servo.tool_axes import least_pipe_m
 
 COLOURS = {"dark": "#4a525c", "steel": "#a5abb3", "copper": "#c47a3d", "soft": "#3d7aa6", "white": "#f4f4f4"}
@@ -241,16 +241,22 @@ matplotlib.use("Agg")
 
 def tool_report(check: ToolCheck, picture: bytes) -> str:
     """Return the page of a tool as one self-contained HTML text."""
-    return render(
-        "tool.html.j2",
-        name=check.loaded.name,
-        tone="warn" if check.contradictions else "good",
-        headline=check.verdict[:1].upper() + check.verdict[1:],
-        notes=check.contradictions,
-        file=check.loaded.file.name,
-        rows=list(check.rows().items()),
-        picture=picture,
+    name, notes = check.loaded.name, " ".join(check.contradictions)
+    said = notes or "Compare the drawing with the tool on the bench: a wrong length shows here."
+    rows = Rows(list(check.rows().items()), ("part", "what was understood"), (0, 1))
+    return page_html(
+        check.verdict[:1].upper() + check.verdict[1:],
+        f"Tool {name} as {check.loaded.file.name} describes it; millimetres and degrees in the flange frame, z out of"
+        " the flange",
+        [("", [Shot(picture, DRAWN, "Drawing of the tool"), rows])],
+        verdict=("warn" if notes else "good", f"Tool {name}", said),
     )
+
+
+DRAWN = (
+    "The tool from three sides, and the picture of its finger camera while the tip is free. Dashed: the capsules that"
+    " are kept clear of the table, of the arm and of the scanner's line of sight."
+)
 
 
 def tool_picture(loaded: LoadedTool) -> bytes:

@@ -27,8 +27,9 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     typed,
 )
+from weldcal.tools.report.page import Bullets, Quantity, Rows, Shot, page_html
 from weldcal.tools.report.pictures import error_bars, error_field
-from weldcal.tools.report.render import fixed, known, render, statistics
+from weldcal.tools.report.render import fixed, known, statistics
 
 
 @dataclass(frozen=True)
@@ -200,65 +201,84 @@ class VerifyReport:
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:
     """Return the whole report as one self-contained HTML text."""
-    ids = [p.id for p in report.poses]
-    fresh = np.array([not p.used_before for p in report.poses])
-    median_of = "of the new scans " if fresh.any() and not fresh.all() else ""
-    tilts = np.array([np.nan if p.tilt_deg is None else p.tilt_deg for p in report.poses])
-    seen = np.isfinite(tilts)
-    stated = report.result.held_out_mm.get("median")
-    stated_tilt = report.result.tilt_deg.get("median")
-    rows = []
-    for p in report.poses:
-        rows.append(
+    r, v, error, tilt, poses = report.result, report.verdict, report.position_error_mm, report.tilt_deg, report.poses
+    fresh = np.array([not p.used_before for p in poses])
+    n, stated, mixed = int(fresh.sum()), r.held_out_mm.get("median"), fresh.any() and not fresh.all()
+
+    def bars(values: list[float | None], quantity: str, told: float | None) -> bytes | None:
+        shown = np.array([np.nan if value is None else value for value in values])
+        seen = np.isfinite(shown)
+        ids = [p.id for p, s in zip(poses, seen, strict=True) if s]
+        line = None if told is None else (told, "stated by the calibration")
+        of = "of the new scans " if mixed else ""
+        return error_bars(ids, shown[seen], fresh[seen], quantity, stated=line, median_of=of) if seen.any() else None
+
+    used_as = ["in the calibration" if p.used_before else "new" for p in poses]
+    rows = [
+        (p.id, used, fixed(p.error_mm, 3), fixed(p.tilt_deg, 3), *fit_cells(report.fits.get(p.id)))
+        for p, used in zip(poses, used_as, strict=True)
+    ]
+    spread = "centres only, no normals" if tilt["median"] is None else f"95 % under {fixed(tilt['p95'], 3)}"
+    n_used, of_mean = f"{len(poses)} of {len(poses) + len(report.refused)}", f"mean {fixed(error['mean'], 3)}"
+    limit = Quantity("Limit of the median", v.limit_mm, "mm", f"for {n} new scan{'s' * (n != 1)}", v.tone)
+    cell = ", ".join(filter(None, (r.robot, r.scanner, r.flange and f"flange {r.flange}")))
+    return page_html(
+        f"Verification on {dataset}",
+        "; ".join(filter(None, (cell, "errors at the flange centre, in the robot's base"))),
+        (
+            ("Warnings", [Bullets(report.warnings)]),
             (
-                p.id,
-                "in the calibration" if p.used_before else "new",
-                fixed(p.error_mm, 3),
-                fixed(p.tilt_deg, 3),
-                *fit_cells(report.fits.get(p.id)),
-            )
-        )
-    return render(
-        "verify.html.j2",
-        dataset=dataset,
-        r=report.result,
-        v=report.verdict,
+                "All scans",
+                [
+                    Shot(
+                        bars([p.error_mm for p in poses], "position error, mm", stated),
+                        ERRORS,
+                        "Bar chart of position errors",
+                    ),
+                    Shot(
+                        bars([p.tilt_deg for p in poses], "tilt, deg", r.tilt_deg.get("median")),
+                        TILTS,
+                        "Bar chart of tilts",
+                    ),
+                    Shot(error_field(r.X_BC, report.observations), FIELD, "Arrow plot of errors"),
+                    Rows(
+                        rows,
+                        ("pose", "", "error, mm", "tilt, deg", "fit sigma, mm", "edge seen, %"),
+                        (0, 1),
+                        "All scans as a table",
+                    ),
+                ],
+            ),
+            ("Scans not used", [Rows(report.refused, ("pose", "reason"), (0, 1))]),
+        ),
         first=report.first,
-        n_new=int(fresh.sum()),
-        error=report.position_error_mm,
-        tilt=report.tilt_deg,
-        stated=stated,
-        stated_tilt=stated_tilt,
-        n=len(report.poses),
-        refused=report.refused,
-        warnings=report.warnings,
-        correction=report.correction,
-        pose_rows=rows,
-        bars=error_bars(
-            ids,
-            np.array([p.error_mm for p in report.poses]),
-            fresh,
-            "position error, mm",
-            stated=None if stated is None else (stated, "stated by the calibration"),
-            median_of=median_of,
+        cards=(
+            Quantity(
+                "Position error, median", error["median"], "mm", f"{of_mean}, 95 % under {fixed(error['p95'], 3)}"
+            ),
+            None if v.limit_mm is None else limit,
+            Quantity("Stated by the calibration", stated, "mm", "held-out median of its own scans"),
+            Quantity("Tilt, median", tilt["median"], "deg", spread),
+            Quantity("Scans used", n_used, tone="warn" if report.refused else "plain"),
         ),
-        tilt_bars=(
-            error_bars(
-                [i for i, s in zip(ids, seen, strict=True) if s],
-                tilts[seen],
-                fresh[seen],
-                "tilt, deg",
-                stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
-                median_of=median_of,
-            )
-            if seen.any()
-            else None
+        facts=(
+            ("calibration made by", r.software),
+            ("scanner correction", "none" if report.correction is None else f"factor {report.correction.formula}"),
+            *report.hashes.items(),
         ),
-        field=error_field(report.result.X_BC, report.observations),
-        hashes=list(report.hashes.items()),
     )
 
 
+ERRORS = (
+    "Distance between the flange centre by the calibration and by the robot. Grey: the scan was used in the"
+    " calibration."
+)
+TILTS = "Angle between the scanned face normal and the one stated by the robot."
+FIELD = (
+    "Error of each scan in the camera frame, across the field of view and along the line of sight. Parallel arrows"
+    " indicate that scanner or base has moved, a pattern indicates an error of the scanner, random arrows indicate"
+    " noise."
+)
 ENOUGH = 4
 """Touches from which on the verdict may be "use"."""
 
@@ -381,10 +401,12 @@ def touch_page(report: TouchReport, source: str) -> str:
         (id, feature, "inside" if inside else "outside", fixed(float(e), 3), fixed(float(limit), 3))
         for id, feature, inside, e, limit in zip(f.ids, f.features, f.inside, errors, 1e3 * f.limit_m, strict=True)
     ]
-    return render(
-        "touch.html.j2",
+    bars = error_bars(list(f.ids), errors, np.ones(len(errors), bool), "touched less scanned, mm")
+    header = ("touch", "feature", "95 % region", "error, mm", "limit, mm")
+    caption = "Distance between the touched point and the scanned one."
+    return page_html(
+        f"Verification by touches: {source}",
+        "Points that the robot's tip touched and the scanner measured",
+        [("All touches", [Shot(bars, caption, "Bar chart of touches"), Rows(rows, header, (0, 1, 2))])],
         first=report.first,
-        source=source,
-        bars=error_bars(list(f.ids), errors, np.ones(len(errors), bool), "touched less scanned, mm"),
-        rows=rows,
     )

@@ -20,8 +20,9 @@ from weldcal.tools.report.first_screen import (
     typed,
     upper,
 )
+from weldcal.tools.report.page import Bullets, Quantity, Rows, Shot, page_html
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, known, render
+from weldcal.tools.report.render import fixed, known
 from weldcal.tools.report.verify import NONE, Verdict
 
 CANNOT_TELL = "cannot tell"
@@ -219,17 +220,35 @@ def verify_pairs_report(report: PairsReport) -> str:
     """Return the whole report as one self-contained HTML text."""
     j = report.judgement
     rows = [(i, "used" if u else "outlier", *(fixed(v, 4) for v in row)) for i, u, *row in report._columns()]
-    return render(
-        "verify_pairs.html.j2",
+    tone, new = report.verdict.tone, j.new is not None
+    bars = error_bars(list(report.ids), 1e3 * j.held_translation_m, j.used, "held-out error, mm")
+    tilts = error_bars(list(report.ids), np.degrees(j.held_rotation_rad), j.used, "held-out rotation, deg")
+    header = ("pair", "", "residual, deg", "residual, mm", "held-out, deg", "held-out, mm")
+    with_it = f"with the pose of the result; {fixed(j.held_out_deg, 3)} degrees"
+    parts: list[str | Shot | Rows] = [
+        f"{report.result}, {report.read_as}. The pose of the target is computed from the other pairs.",
+        Shot(bars, FAR, "Bar chart of held-out errors"),
+        Shot(tilts, TURNED, "Bar chart of held-out rotations"),
+        Rows(rows, header, (0, 1), f"All {len(rows)} pairs as a table"),
+    ]
+    cards = [
+        Quantity("Held-out error, rms", j.held_out_mm, "mm", with_it, tone),
+        Quantity("New solution, rms", j.new_held_out_mm, "mm", "held out, from these pairs alone"),
+        Quantity("Off at the target", j.off_mm, "mm", f"+- {fixed(j.uncertain_mm, 3)} mm, 95 %", tone),
+        Quantity("These pairs show", j.shown_mm, "mm", "and larger errors, with 95 %"),
+    ]
+    return page_html(
+        f"Verification of {report.result} on {report.pairs.rstrip('/').rpartition('/')[2]}",
+        f"{report.mounting.name}: {report.mounting.words}; {report.mounting.equation}",
+        [("Warnings", [Bullets(report.warnings)]), ("All pairs", parts)],
         first=report.first,
-        r=report,
-        j=j,
-        v=report.verdict,
-        n=len(rows),
-        rows=rows,
-        bars=error_bars(list(report.ids), 1e3 * j.held_translation_m, j.used, "held-out error, mm"),
-        tilts=error_bars(list(report.ids), np.degrees(j.held_rotation_rad), j.used, "held-out rotation, deg"),
+        cards=cards if new else cards[:2],
+        facts=[("result", report.result), ("read as", report.read_as), ("pairs", report.pairs)],
     )
+
+
+FAR = "Distance at the target between each pair and the one that the result predicts. Grey: an outlier."
+TURNED = "Angle between each pair and the one that the result predicts."
 
 
 def _small(chance: float) -> str:

@@ -20,7 +20,8 @@ from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.cell.board import CharucoBoard
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
-from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.page import Bullets, Rows, Section, page_html
+from weldcal.tools.report.render import write_atomic
 from weldcal.welding.finger.calibration import (
     FingerIntrinsics,
     TipCalibration,
@@ -230,14 +231,13 @@ def finger_page(report: FingerReport, folder: Path) -> str:
             ("turn of the camera's displacements", turn),
             *((f"stiffness along {axis}", f"{1e-3 * v:.2f} N/mm") for axis, v in t.stiffness_N_per_m.items()),
         ]
-    return render(
-        "finger.html.j2",
-        first=report.first,
-        folder=folder.name,
-        rows=rows,
-        unknown=[] if t is None else t.unknown,
-        without_board=report.without_board,
-    )
+    sections: list[Section] = [
+        ("Figures", [Rows(rows, text=(0, 1))]),
+        ("What the touches leave open", [Bullets([] if t is None else t.unknown)]),
+        ("", [Bullets(report.without_board, folded="Pictures without the board")]),
+    ]
+    title, subtitle = f"Finger calibration from {folder.name}", "Finger camera, its tag and the soft tip"
+    return page_html(title, subtitle, sections, first=report.first)
 
 
 def read_board(path: Path) -> CharucoBoard:

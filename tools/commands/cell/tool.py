@@ -38,8 +38,9 @@ from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.console import emit_summary
 from weldcal.tools.report.first_screen import check_limit, typed
-from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import render, write_atomic, write_json
+from weldcal.tools.report.page import Rows, Shot, page_html
+from weldcal.tools.report.profiler_file import left_out
+from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tool import TcpReport, ToolCheck, tool_picture, tool_report
 
@@ -188,24 +189,13 @@ def tool_tcp(
     write_atomic(folder / "set_tcp.script", report.set_tcp + "\n")
     write_json(folder / "tcp.json", report.summary())
     held = report.found.held_out_m
-    page = render(
-        "profiler_file.html.j2",
+    figures = Rows(list(report.rows().items()), text=(0, 1))
+    page = page_html(
+        f"TCP from {file.name}",
+        f"{len(touches)} touches. {report.set_tcp}",
+        [left_out("touches", "touch", [t.id for t in touches], 1e3 * held), ("Figures", [figures])],
         first=report.first,
-        title=f"TCP from {file.name}",
-        subtitle=f"{len(touches)} touches. {report.set_tcp}",
-        bars=(
-            error_bars([t.id for t in touches], 1e3 * held, np.ones(len(held), bool), "left-out touch, mm")
-            if np.isfinite(held).any()
-            else None
-        ),
-        of="touches",
-        seen=None,
-        seam=None,
-        rows=list(report.rows().items()),
-        sigma=[],
-        warnings=[],
-        lists=[],
-        digest=sha256(file),
+        facts=[("SHA-256 of the file", sha256(file))],
     )
     write_atomic(folder / "report.html", page)
     return Outcome(report.summary(), values={}, rows=report.rows(), first=report.first)
@@ -344,15 +334,14 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
     write_atomic(folder / "tool.png", picture)
     tone: Mapping[str, str] = {HOLDS: "good", EXCEEDED: "bad"}
     tolerance = verdict.tolerance
-    page = render(
-        "tool_measurement.html.j2",
-        name=loaded.name,
-        file=order.tool.name,
-        tone=tone.get(tolerance, "warn"),
-        headline=f"{'Whether the seam tolerance holds' if tolerance == UNKNOWN else 'The seam tolerance'} {tolerance}",
-        verdict_text=f"{report.verdict.reason} {report.verdict.cause}".strip(),
-        rows=[row for row in report.rows().items() if row[0] not in ("verdict", "cause", "next", "page")],
-        picture=picture,
+    headline = f"{'Whether the seam tolerance holds' if tolerance == UNKNOWN else 'The seam tolerance'} {tolerance}"
+    rows = [row for row in report.rows().items() if row[0] not in ("verdict", "cause", "next", "page")]
+    drawn = Shot(picture, "The measured tool from three sides, drawn from its file.", "Drawing of the measured tool")
+    page = page_html(
+        f"Tool {loaded.name}, measured",
+        f"Against {order.tool.name}; millimetres and degrees in the flange frame, with what is not exceeded at 95 %",
+        [("", [Rows(rows, ("part", "found"), (0, 1)), drawn])],
+        verdict=(tone.get(tolerance, "warn"), headline, f"{verdict.reason} {verdict.cause}".strip()),
     )
     write_atomic(folder / "report.html", page)
     write_json(folder / MEASURED_TOOL, report.summary())
