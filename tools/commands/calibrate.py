@@ -68,10 +68,7 @@ _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibr
 def calibrate(
     call: Call,
     dataset: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A folder with poses and clouds (docs/datasets.md), a ROS recording; in motion stream.csv."
-        ),
+        Path | None, typer.Argument(help="A folder with poses and clouds (docs/datasets.md), or a ROS recording.")
     ] = None,
     scenario: Annotated[str | None, option("--scenario", "NAME", "Calibrate live in this scenario instead.")] = None,
     robot: Annotated[

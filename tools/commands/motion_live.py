@@ -18,7 +18,7 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_result, motion_screen
-from weldcal.tools.report.page import Rows, page_html
+from weldcal.tools.report.page import TableRows, page_html
 from weldcal.tools.report.render import statistics, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
@@ -179,7 +179,7 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
     page = page_html(
         f"Calibration in motion, live, in “{options.scenario}”",
         scenario.description,
-        [("Figures", [Rows(rows, text=(0, 1))])],
+        [("Figures", [TableRows(rows, text=(0, 1))])],
         first=outcome.first,
         facts=[("scenario", "scenario.yaml beside this report")],
         recording=finished.meshcat is not None,

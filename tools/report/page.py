@@ -26,7 +26,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """A table; the columns of `text` are words, the others numbers. `folded` is the title of a closed one."""
 
     rows: Sequence[Sequence[object]]
@@ -55,14 +55,14 @@ class Bullets:
 
 
 @dataclass(frozen=True)
-class Facts:
+class FactList:
     """Names with their values; closed under the title of `folded`."""
 
     facts: Sequence[tuple[str, object]]
     folded: str = ""
 
 
-Section = tuple[str, Sequence[str | Rows | Shot | Bullets | Facts]]
+Section = tuple[str, Sequence[str | TableRows | Shot | Bullets | FactList]]
 """A heading (empty: none) with what stands below it; a heading above nothing is not shown."""
 
 

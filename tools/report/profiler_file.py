@@ -22,7 +22,7 @@ from weldcal.tools.report.first_screen import (
     radius_95,
     typed,
 )
-from weldcal.tools.report.page import Bullets, Facts, Rows, Section, Shot, page_html
+from weldcal.tools.report.page import Bullets, FactList, Section, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import OURS, error_bars, subplots, svg
 from weldcal.tools.report.render import fixed, sigma_rows
 
@@ -217,11 +217,11 @@ def left_out(of: str, one: str, ids: list[str], held_mm: Array) -> Section:
 def _sections(
     found: Mapping[str, Any], pictures: Sequence[Section], sigma: Sequence[tuple[str, object]]
 ) -> list[Section]:
-    lists = Facts(_lists(found), "Scans that were not used, by number")
+    lists = FactList(_lists(found), "Scans that were not used, by number")
     return [
         ("Warnings", [Bullets(found.get("warnings", ()))]),
         *pictures,
-        ("Figures", [Rows(_rows(found), text=(0, 1)), Facts(sigma), lists]),
+        ("Figures", [TableRows(_rows(found), text=(0, 1)), FactList(sigma), lists]),
     ]
 
 

@@ -35,7 +35,7 @@ from weldcal.tools.report.first_screen import (
     expected_error,
     limit_tolerance,
 )
-from weldcal.tools.report.page import Rows, Shot, page_html
+from weldcal.tools.report.page import Shot, TableRows, page_html
 from weldcal.tools.report.pictures import subplots
 from weldcal.welding.servo.tool_axes import least_pipe_m
 
@@ -243,7 +243,7 @@ def tool_report(check: ToolCheck, picture: bytes) -> str:
     """Return the page of a tool as one self-contained HTML text."""
     name, notes = check.loaded.name, " ".join(check.contradictions)
     said = notes or "Compare the drawing with the tool on the bench: a wrong length shows here."
-    rows = Rows(list(check.rows().items()), ("part", "what was understood"), (0, 1))
+    rows = TableRows(list(check.rows().items()), ("part", "what was understood"), (0, 1))
     return page_html(
         check.verdict[:1].upper() + check.verdict[1:],
         f"Tool {name} as {check.loaded.file.name} describes it; millimetres and degrees in the flange frame, z out of"

@@ -27,7 +27,7 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     typed,
 )
-from weldcal.tools.report.page import Bullets, Quantity, Rows, Shot, page_html
+from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, known, statistics
 
@@ -241,7 +241,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
                         "Bar chart of tilts",
                     ),
                     Shot(error_field(r.X_BC, report.observations), FIELD, "Arrow plot of errors"),
-                    Rows(
+                    TableRows(
                         rows,
                         ("pose", "", "error, mm", "tilt, deg", "fit sigma, mm", "edge seen, %"),
                         (0, 1),
@@ -249,7 +249,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
                     ),
                 ],
             ),
-            ("Scans not used", [Rows(report.refused, ("pose", "reason"), (0, 1))]),
+            ("Scans not used", [TableRows(report.refused, ("pose", "reason"), (0, 1))]),
         ),
         first=report.first,
         cards=(
@@ -407,6 +407,6 @@ def touch_page(report: TouchReport, source: str) -> str:
     return page_html(
         f"Verification by touches: {source}",
         "Points that the robot's tip touched and the scanner measured",
-        [("All touches", [Shot(bars, caption, "Bar chart of touches"), Rows(rows, header, (0, 1, 2))])],
+        [("All touches", [Shot(bars, caption, "Bar chart of touches"), TableRows(rows, header, (0, 1, 2))])],
         first=report.first,
     )

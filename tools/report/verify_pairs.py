@@ -20,7 +20,7 @@ from weldcal.tools.report.first_screen import (
     typed,
     upper,
 )
-from weldcal.tools.report.page import Bullets, Quantity, Rows, Shot, page_html
+from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, known
 from weldcal.tools.report.verify import NONE, Verdict
@@ -225,11 +225,11 @@ def verify_pairs_report(report: PairsReport) -> str:
     tilts = error_bars(list(report.ids), np.degrees(j.held_rotation_rad), j.used, "held-out rotation, deg")
     header = ("pair", "", "residual, deg", "residual, mm", "held-out, deg", "held-out, mm")
     with_it = f"with the pose of the result; {fixed(j.held_out_deg, 3)} degrees"
-    parts: list[str | Shot | Rows] = [
+    parts: list[str | Shot | TableRows] = [
         f"{report.result}, {report.read_as}. The pose of the target is computed from the other pairs.",
         Shot(bars, FAR, "Bar chart of held-out errors"),
         Shot(tilts, TURNED, "Bar chart of held-out rotations"),
-        Rows(rows, header, (0, 1), f"All {len(rows)} pairs as a table"),
+        TableRows(rows, header, (0, 1), f"All {len(rows)} pairs as a table"),
     ]
     cards = [
         Quantity("Held-out error, rms", j.held_out_mm, "mm", with_it, tone),

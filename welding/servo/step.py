@@ -330,11 +330,9 @@ def _ended(state: WeldingState, config: ServoConfig) -> WeldingState:
     if state.phase == Phase.COAST and state.s_tip - state.lost_at > config.gap.coast_m:
         text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return fault(state, text)
-    if state.phase == Phase.FINISH:
-        return state
     # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
     last = state.plan_fit.curve.drawn_m if cut_short and tracks else state.s_end
-    if state.s_tip <= last + (config.gap.end_window_m if tracks else 0.0):
+    if state.phase == Phase.FINISH or state.s_tip <= last + (config.gap.end_window_m if tracks else 0.0):
         return state
     # Still in contact this far beyond the plan's end: the seam does not end before this point.
     return finish(changed(state, s_end=state.s_tip) if tracks and not cut_short else state)
@@ -344,10 +342,11 @@ def _moved(
     state: WeldingState, sample: ServoSample, seam: SeamFrame, off: Array, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, TorchTarget, TickMotion, tuple[float, float]]:
     """The motion of this tick, the torch's target, and what the wire is off it: m to the left and up."""
-    assert (fit := state.plan_fit) is not None
+    assert state.plan_fit is not None
+    curve = state.plan_fit.curve
     state = _slewed(state, *_servo(state, off, sample, config), config, dt)
     p_BW = np.asarray(sample.X_BT.translation()) + sample.X_BT.rotation().matrix() @ config.p_TW
-    target = torch_target(state, fit.curve, p_BW, config)
+    target = torch_target(state, curve, p_BW, config)
     if state.torch_on and config.weave.amplitude_m > 0.0:
         state, target = weaving(state, target, p_BW, sample.time - state.lit_at, config, dt)
     motion = guarded_motion(

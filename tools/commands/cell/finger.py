@@ -20,7 +20,7 @@ from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.cell.board import CharucoBoard
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
-from weldcal.tools.report.page import Bullets, Rows, Section, page_html
+from weldcal.tools.report.page import Bullets, Section, TableRows, page_html
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.finger.calibration import (
     FingerIntrinsics,
@@ -232,7 +232,7 @@ def finger_page(report: FingerReport, folder: Path) -> str:
             *((f"stiffness along {axis}", f"{1e-3 * v:.2f} N/mm") for axis, v in t.stiffness_N_per_m.items()),
         ]
     sections: list[Section] = [
-        ("Figures", [Rows(rows, text=(0, 1))]),
+        ("Figures", [TableRows(rows, text=(0, 1))]),
         ("What the touches leave open", [Bullets([] if t is None else t.unknown)]),
         ("", [Bullets(report.without_board, folded="Pictures without the board")]),
     ]

@@ -38,7 +38,7 @@ from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.console import emit_summary
 from weldcal.tools.report.first_screen import check_limit, typed
-from weldcal.tools.report.page import Rows, Shot, page_html
+from weldcal.tools.report.page import Shot, TableRows, page_html
 from weldcal.tools.report.profiler_file import left_out
 from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
@@ -189,7 +189,7 @@ def tool_tcp(
     write_atomic(folder / "set_tcp.script", report.set_tcp + "\n")
     write_json(folder / "tcp.json", report.summary())
     held = report.found.held_out_m
-    figures = Rows(list(report.rows().items()), text=(0, 1))
+    figures = TableRows(list(report.rows().items()), text=(0, 1))
     page = page_html(
         f"TCP from {file.name}",
         f"{len(touches)} touches. {report.set_tcp}",
@@ -340,7 +340,7 @@ def run_measurement(order: MeasureOrder, folder: Path, tell: Callable[[str, floa
     page = page_html(
         f"Tool {loaded.name}, measured",
         f"Against {order.tool.name}; millimetres and degrees in the flange frame, with what is not exceeded at 95 %",
-        [("", [Rows(rows, ("part", "found"), (0, 1)), drawn])],
+        [("", [TableRows(rows, ("part", "found"), (0, 1)), drawn])],
         verdict=(tone.get(tolerance, "warn"), headline, f"{verdict.reason} {verdict.cause}".strip()),
     )
     write_atomic(folder / "report.html", page)
