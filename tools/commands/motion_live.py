@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
 
 from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
 from weldcal.calibration.motion.estimate import MotionEstimate
@@ -13,6 +12,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
 from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.runner import Progress, Run
+from weldcal.systems.scenario.loading import scenario_text
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
@@ -166,7 +166,7 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
     record, calibration = added.record(run.root), added.calibration(run.root)
     outcome = MotionOutcome(options, finished, record, calibration.estimate)
     options.out.mkdir(parents=True, exist_ok=True)
-    write_atomic(options.out / "scenario.yaml", yaml_dump_typed(scenario))
+    write_atomic(options.out / "scenario.yaml", scenario_text(scenario))
     if calibration.estimate is not None:
         result = calibration_result(outcome, calibration.estimate)
         export_all(result, options.out)

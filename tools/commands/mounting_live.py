@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from pydrake.common.yaml import yaml_dump_typed
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import unit_quaternion
@@ -40,7 +39,7 @@ from weldcal.models.robots import base_circle
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.loading import load_scenario, scenario_text
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, command
 from weldcal.tools.commands.run import JobRun, run_job, run_options
@@ -108,7 +107,7 @@ def write_mounting(report: MountingReport, finished: JobRun | None = None) -> No
     folder, picture = report.folder, None
     source, text = "dataset.yaml", ""
     if report.run is not None:
-        source, text = "scenario.yaml", yaml_dump_typed(report.run.cell.scenario)
+        source, text = "scenario.yaml", scenario_text(report.run.cell.scenario)
         write_atomic(folder / source, text)
         write_scans(report)
         picture = station_picture(report)

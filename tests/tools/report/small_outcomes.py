@@ -298,7 +298,7 @@ def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
         refused=(("p77", "No ring."),),
         estimate=estimate,
         predicted_error_m=9e-5,
-        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
+        history=((4, 3e-4, 1e-4), (10, 9e-5, 5e-5)),
         verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
     )
     result = DemoResult(
