@@ -156,7 +156,7 @@ def test_a_live_calibration_reports_what_the_offline_one_does(live_calibration: 
         " seconds"
     )
     assert set(keys.split()) <= set(live_calibration.summary)
-    assert live_calibration.summary["n_scans"] == 6
+    assert live_calibration.summary["n_scans"] == 5
     assert "joints [" in live_calibration.summary["next_pose"]  # a pose that was planned and not visited
 
 
