@@ -89,7 +89,7 @@ def test_the_torch_keeps_to_a_seam_that_the_plan_got_wrong(short_job: DemoResult
 
 
 def test_what_the_tip_felt_is_the_seam_to_hundredths(short_job: DemoResult) -> None:
-    found = figures(short_job, "s_groove", "guarded", 5)
+    found = figures(short_job, "s_groove", 5)
     assert found.completed
     # The targets of the figure `cell`; the offsets are small because the seat is derived and the tag zeroed, not
     # because anything was fitted to this groove: the tag's picture is half a percent too large, 0.01 mm of 2 mm and

@@ -83,7 +83,7 @@ def _with_angles(folder: Path, scans: list[Observation], q: Array) -> Path:
 
 
 def test_refined_joints_come_as_a_kinematics_file_that_verify_uses(tmp_path: Path) -> None:
-    world = station(7, links=False)
+    world = station(10, links=False)
     data = _with_angles(tmp_path / "scans", world.observations, world.q)
     new = _with_angles(tmp_path / "new", world.new, world.new_q)
     found = calibrate_dataset(data, tmp_path / "joints", refine="joints")

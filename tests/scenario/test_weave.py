@@ -117,5 +117,3 @@ def test_a_dwell_is_one_number_or_two() -> None:
         order = load_scenario("straight_groove", CELL.format(weave=f"{{dwell_s: {dwell}}}")).welding.weave
         assert order is not None
         assert (order.weave().dwell_left_s, order.weave().dwell_right_s) == sides
-    with pytest.raises(InputError, match="law: guarded"):
-        load_scenario("straight_groove", CELL.format(weave="{}, law: fixed"))
