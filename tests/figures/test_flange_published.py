@@ -23,6 +23,7 @@ from tests.figures.flange.published.pairs import (
     study_pairs,
 )
 from tests.figures.flange.published.report import table1_rows
+from tests.figures.flange.published.scenes import FLANGE, FOUND_M, cut_scene, published_centre
 from tests.figures.flange.published.simulation import (
     X_BC_TRUE,
     algorithm1_batch,
@@ -31,17 +32,21 @@ from tests.figures.flange.published.simulation import (
     grid_points,
     noisy_points,
     simulate,
+    with_scale,
 )
 from tests.figures.harness import Run
 from tests.places import SHARED_DATA, needs
+from tests.worlds.flange_frames import facing, flange_frame
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.writing import save_dataset
+from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import fit_rigid
 from weldcal.calibration.published.algorithm1 import COMPONENTS, VerificationError, algorithm1_start, algorithm1_step
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.models.scanners import get_scanner
 
 DATA = SHARED_DATA / "flange"
 needs_data = needs(DATA)
@@ -203,3 +208,31 @@ def test_table_1_names_pairs_that_hold_no_stored_runs() -> None:
     below = {name: rows[rows.index(f"{name}, paper") + 1] for name in ("UR5 & PhoXi M", "AUBO i5 & PhoXi S")}
     assert below["UR5 & PhoXi M"] == "  pairs without stored runs"
     assert below["AUBO i5 & PhoXi S"] == "  no data of it here"
+
+
+def test_the_scale_of_eq_10_is_found_where_points_are_scaled() -> None:
+    p_B = grid_points()
+    exact = X_BC_TRUE.inverse() @ p_B.T
+    scaled = with_scale(p_B, (exact.T / 1.01)[None])
+    assert np.abs(scaled["c = tr(DS) / sigma²"].e).max() < 1e-12
+    assert np.abs(scaled["c = 1 (Eq. 9)"].e).max() > 1e-3
+    assert scaled["c as printed, sigma²"].at_tcp.min() > 0.8, "the last line of Eq. (11) is a variance, not a scale"
+
+
+def test_the_best_of_three_orders_by_the_truth_is_nearer_to_it_at_the_camera() -> None:
+    s = simulate(levels=2, realisations=40, seed=4, progress=lambda what, done: None)
+    assert (s.chosen_ratio[3:5] > 1.2 * s.ratio[3:5]).all()
+
+
+def test_a_whole_scene_is_cut_down_to_the_face() -> None:
+    rng = np.random.default_rng(5)
+    X_CR = facing(np.array([0.01, 0.02, 0.65]), 0.2, 0.3, 1.0)
+    scene = flange_frame(get_scanner("phoxi_m", 824), FLANGE, rng, X_CR=X_CR).points_C.reshape(-1, 3)
+    scene = scene[np.isfinite(scene).all(axis=1)]
+    clusters = cut_scene(scene, 0.5, 0.8)
+    near = [np.linalg.norm(c.mean(axis=0) - X_CR.translation()) < 0.01 for c in clusters]
+    assert any(near)
+    assert sum(len(c) for c in clusters) < 0.3 * len(scene)
+    assert np.linalg.norm(published_centre(scene, 0.5, 0.8) - X_CR.translation()) < FOUND_M
+    with pytest.raises(FlangeNotFound):
+        published_centre(scene, 0.05, 0.1)
