@@ -65,6 +65,8 @@ class EdgeRow:
     crb_mm: float
     alpha_mean_deg: float
     alpha_std_deg: float
+    group_mean_deg: float
+    group_std_deg: float
     d_mean_mm: float
     d_std_mm: float
     radius_mm: float
@@ -117,8 +119,12 @@ def edge_rows(
     return rows
 
 
-def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple[float, float, float, float]:
-    """Compute mean and std of d alpha (deg, unsigned, from a group's first point) and d (mm), section 4.1."""
+def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple[float, ...]:
+    """Compute mean and std of d alpha (deg, unsigned, in two readings) and of d (mm), section 4.1.
+
+    The angle of the edge's principal direction to the line from a group's first point to each other one; and to the
+    principal direction of each group.
+    """
     p_F = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ R.T + t
     at = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation
     group = at.reshape(-1, TRANSLATIONS, 3)
@@ -126,18 +132,27 @@ def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple
     e = np.linalg.svd(u, full_matrices=False)[2][0]
     length = np.linalg.norm(u, axis=1)
     alpha = np.degrees(np.arccos(np.clip(np.abs(u @ e) / np.maximum(length, 1e-12), 0.0, 1.0)))
+    lines = np.linalg.svd(group - group.mean(axis=1, keepdims=True), full_matrices=False)[2][:, 0]
+    of_groups = np.degrees(np.arccos(np.clip(np.abs(lines @ e), 0.0, 1.0)))
     off = at - at.mean(axis=0)
     d = 1e3 * np.linalg.norm(off - np.outer(off @ e, e), axis=1)
-    return float(alpha.mean()), float(alpha.std()), float(d.mean()), float(d.std())
+    return tuple(float(v) for values in (alpha, of_groups, d) for v in (values.mean(), values.std()))
+
+
+def ball_points(trial: EdgeTrial, R: Floats, t: Floats) -> Floats:
+    """Points (n, m, 3) m of the ball's n profiles in the base, by a calibration."""
+    assert trial.ball is not None
+    assert trial.ball_poses is not None
+    p = np.stack([trial.ball[..., 0], np.zeros(trial.ball.shape[:2]), trial.ball[..., 1]], axis=2) @ R.T + t
+    poses = trial.ball_poses
+    return np.asarray(np.einsum("nij,nmj->nmi", poses.rotation, p) + poses.translation[:, None])
 
 
 def _ball_radius_mm(trial: EdgeTrial, R: Floats, t: Floats) -> float:
     """Radius of the sphere through all profiles of the ball, brought into one frame by a calibration."""
     if trial.ball is None or trial.ball_poses is None:
         return float("nan")
-    p = np.stack([trial.ball[..., 0], np.zeros(trial.ball.shape[:2]), trial.ball[..., 1]], axis=2) @ R.T + t
-    poses = trial.ball_poses
-    at = (np.einsum("nij,nmj->nmi", poses.rotation, p) + poses.translation[:, None]).reshape(-1, 3)
+    at = ball_points(trial, R, t).reshape(-1, 3)
     middle = at.mean(axis=0)
     q = at - middle
     s = np.linalg.lstsq(np.column_stack([2.0 * q, np.ones(len(q))]), np.einsum("ni,ni->n", q, q), rcond=None)[0]

@@ -45,6 +45,7 @@ from weldcal.calibration.profiler.sphere.joint import leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.console import Progress
+from weldcal.tools.report.pictures import OURS, PLANNED, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 
 DEGENERATE = {
@@ -265,8 +266,41 @@ def profiler(run: Run) -> None:
     run.table("", ("figure", "reached", "target", ""), rows)
     for title, header, lines in (*_edge_tables(edge), *_sphere_tables(sphere)):
         run.table(title, header, lines)
+    pictures(run, edge)
     if run.data is not None and any(missed):
         raise Missed(f"{sum(missed)} targets of the fixed files are missed; see the table.")
+
+
+def pictures(run: Run, rows: list[EdgeRow]) -> None:
+    """Draw Fig. 6 and 7 of the edge paper over the rotations, and its Fig. 8: a ball's profiles brought together."""
+    names = list(dict.fromkeys(r.name for r in rows))
+    for number, what, label in (
+        (6, "alpha_{}_deg", "angle to the edge, deg"),
+        (7, "d_{}_mm", "distance to the edge, mm"),
+    ):
+        picture, panels = subplots(7.6, 2.8, 1, len(names), sharey=True, squeeze=False)
+        for axes, name in zip(panels[0], names, strict=True):
+            for method, colour, shift in (("paper", PLANNED, -0.35), ("joint", OURS, 0.35)):
+                found = [r for r in rows if r.name == name and r.method == method]
+                mean, std = (np.array([getattr(r, what.format(part)) for r in found]) for part in ("mean", "std"))
+                x = np.array([r.rotations for r in found]) + shift
+                error = [np.minimum(std, mean), std]  # neither can be negative
+                axes.errorbar(x, mean, yerr=error, color=colour, marker="o", ms=4, lw=1.2, capsize=3, label=method)
+            axes.set_title(papers.TITLES[name], fontsize=9)
+            axes.set_xticks(papers.COUNTS)
+            plain(axes, "rotations", "")
+        panels[0, 0].set_ylabel(label)
+        panels[0, 0].legend(frameon=False, fontsize=8)
+        run.write(f"edge_fig{number}.svg", svg(picture))
+    trial = next(made_edge_trials("xy_paper", 1, run.seed))
+    pose = trial.joint()
+    points = papers.ball_points(trial, pose.rotation, pose.translation) / MM
+    picture, axes = subplots(6.0, 4.2, subplot_kw={"projection": "3d"})
+    for k, profile in enumerate(points - points.reshape(-1, 3).mean(axis=0)):
+        axes.plot(*profile.T, color=f"C{k // 6 % 10}", lw=0.8)  # six profiles of each of ten rotations
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axes.set_aspect("equal")
+    run.write("edge_fig8.svg", svg(picture))
 
 
 def compute(
@@ -335,9 +369,11 @@ def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[tuple[str, Row, list[Row]]
         for method in papers.EDGE_METHODS:
             found = [by[name, method, k] for k in n]
             alpha = (pair(r.alpha_mean_deg, r.alpha_std_deg, 2) for r in found)
+            lines = tuple(pair(r.group_mean_deg, r.group_std_deg, 2) for r in found)
             d = (pair(r.d_mean_mm, r.d_std_mm, 3) for r in found)
             for table, cells in zip(tables, (alpha, d, (fixed(r.radius_mm, 3) for r in found)), strict=True):
                 table.append((papers.TITLES[name], method, *cells))
+            tables[0].append((f"{papers.TITLES[name]}, a line for each rotation", method, *lines))
         for k in n:
             p, q = (by[name, m, k] for m in papers.EDGE_METHODS)
             three = ((p.rotation_deg, p.translation_mm), (q.rotation_deg, q.translation_mm), (q.crb_deg, q.crb_mm))
