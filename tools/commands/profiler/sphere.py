@@ -31,25 +31,20 @@ from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, optio
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
-    ROBOT_SIGMA,
-    Z_SIGMA,
     FileArgument,
-    FormOption,
-    PitchOption,
     PlanOption,
     PosesOption,
     RadiusOption,
-    SetOption,
     Sigmas,
     TipOption,
     TouchesOption,
-    TrialOption,
     UnitOption,
     check_number,
     figures_of,
     finish,
     next_poses,
     outcome_of,
+    read_measurements,
     widened,
     with_warnings,
 )
@@ -63,34 +58,31 @@ ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
 MODELS = ("auto", "rigid", "affine", "affine+joints")
 
 
-@command("profiler sphere", short_help="Calibrate by a sphere, with or without touches of it.")
+@command(
+    "profiler sphere",
+    keys=("robot-form", "set", "trial", "pitch", "sigma-robot", "sigma-z"),
+    short_help="Calibrate by a sphere, with or without touches of it.",
+)
 def sphere(
     call: Call,
     file: FileArgument,
     unit: UnitOption = None,
-    dataset: SetOption = "",
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     radius: RadiusOption = None,
     model: Annotated[str, option("--model", "M", "auto, rigid, affine or affine+joints.")] = "auto",
     arm: Annotated[str, option("--arm", "NAME", "Arm whose kinematic table is used, for example ur10e.")] = "",
     touches: TouchesOption = None,
     tip: TipOption = "",
-    sigma_robot: Annotated[float, option("--sigma-robot", "MM", ROBOT_SIGMA)] = 0.03,
-    sigma_z: Annotated[float, option("--sigma-z", "MM", Z_SIGMA)] = 0.05,
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides
     and no pure translations."""
     check_limit(limit_mm)
-    sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
+    robot_m, z_m = (1e-3 * call.reading.get(key, usual) for key, usual in (("sigma-robot", 0.03), ("sigma-z", 0.05)))
+    sigmas = Sigmas(robot_m, z_m, z_m)
     lost: list[int] = []
-    data, measured = read_sphere(
-        call, file, unit, dataset, trial, radius, touches, tip, arm, lost, PosesStated(poses, robot_form, pitch)
-    )
+    data, measured = read_sphere(call, file, unit, poses, radius, touches, tip, arm, lost)
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
     made, summary = finish_sphere(
         measured,
@@ -108,20 +100,17 @@ def read_sphere(
     call: Call,
     file: Path,
     unit: str | None,
-    dataset: str,
-    trial: int | None,
+    poses: Path | None,
     radius: float | None,
     touches: Path | None,
     tip: str,
     arm: str = "",
     lost: list[int] | None = None,
-    stated: PosesStated | None = None,
 ) -> tuple[Measurements, SphereData]:
     """Return the measurements of a sphere and its touches, with the reading of the poses that the arcs select."""
     tip_m = parse_tip(tip)
-    stated = stated or PosesStated()
-    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial, stated=stated)
-    felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=stated.form))
+    data, form = read_measurements(call, file, unit, poses), call.reading.get("robot-form", "")
+    felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=form))
     radius_m = None if radius is None else 1e-3 * radius
     lost = [] if lost is None and len(data.readings) > 1 else lost
 
@@ -339,16 +328,16 @@ def finish_sphere(
     return finish(record, found, np.vstack(data.profiles), held, source, out, limit_mm)
 
 
-@command("profiler compensate", short_help="Calibrate by the published sphere method.")
+@command(
+    "profiler compensate",
+    keys=("robot-form", "set", "trial", "pitch"),
+    short_help="Calibrate by the published sphere method.",
+)
 def compensate(
     call: Call,
     file: FileArgument,
     unit: UnitOption = None,
-    dataset: SetOption = "",
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     radius: RadiusOption = None,
     touches: TouchesOption = None,
     tip: TipOption = "",
@@ -360,8 +349,7 @@ def compensate(
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same
     file."""
     check_limit(limit_mm)
-    stated = PosesStated(poses, robot_form, pitch)
-    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, stated=stated)
+    data, measured = read_sphere(call, file, unit, poses, radius, touches, tip)
     record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
     if found["wrong_sides"]:
         console.emit_warning(
