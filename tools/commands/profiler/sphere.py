@@ -27,7 +27,7 @@ from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools import console
-from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
@@ -341,16 +341,13 @@ def compensate(
     radius: RadiusOption = None,
     touches: TouchesOption = None,
     tip: TipOption = "",
-    solve_tip: Annotated[
-        bool, switch("--solve-tip", "Also estimate the tip from the touches (not in the paper).")
-    ] = False,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same
     file."""
     check_limit(limit_mm)
     data, measured = read_sphere(call, file, unit, poses, radius, touches, tip)
-    record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
+    record, found = calibrate_compensate(data, measured)
     if found["wrong_sides"]:
         console.emit_warning(
             f"The side of the sphere's centre is likely wrong in scans {found['wrong_sides']}. Check their sign."
@@ -362,9 +359,7 @@ def compensate(
     return outcome_of(call, summary, made)
 
 
-def calibrate_compensate(
-    file: Measurements, data: SphereData, *, solve_tip: bool = False
-) -> tuple[ProfilerRecord, dict[str, Any]]:
+def calibrate_compensate(file: Measurements, data: SphereData) -> tuple[ProfilerRecord, dict[str, Any]]:
     """The sphere paper's method: centres on the sides given in the file, two linear steps, compensation by touches."""
     sign = file.needed(
         "sign", "on which side (+1 or -1, along y) of the scan plane each scan has the centre; 'sphere' needs none"
@@ -385,9 +380,7 @@ def calibrate_compensate(
     )
     R, t = data.poses.rotation, data.poses.translation
     linear = published.sphere_linear(R, t, centers, translated)
-    felt = published.fit_touch_sphere(
-        data.touches.rotation, data.touches.translation, data.tip, data.radius_m, solve_tip=solve_tip
-    )
+    felt = published.fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
     best = published.compensate(linear, R, t, centers, felt.center)
 
     def off(rotation: Floats, translation: Floats) -> float:
