@@ -378,7 +378,7 @@ def _of_heights(heights: list[Floats], name: str, pitch_mm: float | None, form: 
     if pitch_mm is None:
         raise InputError(
             f"'{name}' holds {len(heights)} profiles of {len(heights[0])} heights and no x. Give the distance of the"
-            " points with --as pitch=MM (for example --as pitch=0.0125), or write the x of each column into a first row."
+            " points in mm, for example --as pitch=0.0125, or write the x of each column into a first row."
         )
     if not 1e-6 < pitch_mm < 10.0:
         raise InputError(f"A distance of {pitch_mm:g} mm between points cannot be used; give --as pitch in mm.")

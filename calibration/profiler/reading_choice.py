@@ -111,8 +111,8 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
         raise InconsistentData(
             f"The profiles do not show how the poses are written: read as {one.words} they leave {_mm(best)} of one"
             f" {what}, as {other.words} {_mm(fits[rivals[0]])}, and the results differ. State the right one with"
-            f" --as robot-form={one.form} or --as robot-form={other.form}, or take more scans with the flange turned about"
-            " other axes."
+            f" --as robot-form={one.form} or --as robot-form={other.form}, or take more scans with the flange turned"
+            " about other axes."
         )
     dead = [k for k in order if k not in alive]
     chosen = min(alive)  # the usual one of those that are the same
