@@ -73,10 +73,10 @@ class HandEyeOptions:
         if self.board is not None and self.camera is not None and Path(self.camera).is_file():
             asked = replace(self, intrinsics=Path(self.camera), camera=None)
         if asked.intrinsics is not None and asked.board is None:
-            raise InputError("A camera file (--intrinsics) goes with pictures: name the board in them with --board.")
+            raise InputError("A camera file (--as intrinsics) goes with pictures: name the board in them with --board.")
         otherwise = self.motions or self.corners is False or self.refine is not None or self.equation == "axb-ycz"
         if self.board is not None and otherwise:
-            without = "--motions, --no-corners and --refine"
+            without = "--as motions, --no-corners and --refine"
             raise InputError(f"Pictures (--board) are solved by their corners: omit {without}.")
         needs = {"A kinematics file (--kinematics) needs": self.kinematics, "Robot errors (--refine) need": self.refine}
         for option, value in needs.items():
@@ -187,7 +187,7 @@ def _read(file: Path, asked: HandEyeOptions) -> tuple[PosePairs, ClockOffset | N
     streams = None
     if pose_streams.is_stream_file(file):
         if unit not in (None, "m") or asked.motions:
-            raise InputError("Two streams of poses are in metres; omit --unit and --motions.")
+            raise InputError("Two streams of poses are in metres; omit --unit and --as motions.")
         streams = pose_streams.synchronise(
             pose_streams.read_streams(file), mounting=mounting or "eye_in_hand", source=file.name
         )
@@ -201,7 +201,7 @@ def _read(file: Path, asked: HandEyeOptions) -> tuple[PosePairs, ClockOffset | N
 def _solve_motions(pairs: PosePairs, equation: str, config: HandEyeConfig) -> _Solution:
     """Solve AX = XB with the motions A and B of a file."""
     if equation != "ax-xb":
-        raise InputError("Motions (--motions) belong to ax-xb.")
+        raise InputError("Motions (--as motions) belong to ax-xb.")
     result = solve_ax_xb(pairs.robot, pairs.camera, config)
     problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
     return _Solution(pairs, problem, with_scale(problem, result, config))
@@ -265,7 +265,7 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Cloc
         return None
     forms = (stated.robot, stated.camera)
     robot, camera = (
-        one.of_arm(stated.arm).stated(form, f"--{who}-form")
+        one.of_arm(stated.arm).stated(form, f"--as {who}-form")
         for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
     )
     return pose_streams.synchronise_lists(

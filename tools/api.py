@@ -168,8 +168,8 @@ def hand_eye(
     Args:
         robot: X_BF (n, 4, 4), the robot's flange in its base; camera: X_CM (n, 4, 4), the target in the camera; metres.
         mounting: eye_in_hand or eye_on_base, and others of `weldcal hand-eye`.
-        robot_form, camera_form: how the matrices are to be read, as --robot-form and --camera-form: matrix, or
-            "matrix,inverse".
+        robot_form, camera_form: how the matrices are to be read, as the keys robot-form and camera-form of the command:
+            matrix, or "matrix,inverse".
 
     Returns:
         `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`,

@@ -160,7 +160,7 @@ def synchronise_lists(
         who = "robot" if len(a) >= len(b) else "camera"
         raise DatasetError(
             f"The rotations of '{(robot if who == 'robot' else camera).name}' fit {max(len(a), len(b))}"
-            f" conventions. Name the right one, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
+            f" conventions. Name the right one, for example --as {who}-form={(a if who == 'robot' else b)[0].form}."
         )
     tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None
@@ -188,7 +188,7 @@ def synchronise_lists(
     if len(tried) > 1 and tried[1][0] < _FAR_BETTER**2 * tried[0][0]:
         raise DatasetError(
             f"Two readings of the trajectories fit alike: {tried[0][2]} with {tried[0][3]}, and {tried[1][2]} with"
-            f" {tried[1][3]}. State one with --robot-form and --camera-form."
+            f" {tried[1][3]}. State one with --as robot-form=FORM or --as camera-form=FORM."
         )
     _, found, form, other_form = tried[0]
     reading = {

@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.calibration.errors import FeatureNotFound, InconsistentData
 from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import WeldcalError
 
 SIGNS = {"away": 1.0, "towards": -1.0}
 """What multiplies z so that it grows away from the sensor, by where the z of the profiles grows."""
@@ -34,10 +34,8 @@ class SignFit:
     error: WeldcalError | None = None
 
 
-def checked_sign(stated: str) -> tuple[str, ...]:
-    """Return the signs to try: the stated one, or both. Raises InputError for another word."""
-    if stated and stated not in SIGNS:
-        raise InputError(f"z grows away from the sensor or towards it: --z away or --z towards, not '{stated}'.")
+def signs_to_try(stated: str) -> tuple[str, ...]:
+    """Return the stated sign, or both."""
     return (stated,) if stated else tuple(SIGNS)
 
 
@@ -95,8 +93,8 @@ def choose_sign(fits: Mapping[str, SignFit], total: int, what: str, alike: Calla
             chosen = order[1]
         elif not (second.kept and alike()):
             raise InconsistentData(
-                f"The profiles do not show where z grows: {counts}. The results differ. State it with --z away or"
-                " --z towards; heights (Gocator, Keyence) grow towards the sensor."
+                f"The profiles do not show where z grows: {counts}. The results differ. State it with --as z=away or"
+                " --as z=towards; heights (Gocator, Keyence) grow towards the sensor."
             )
     return chosen, f"z of the profiles grows {WORDS[chosen]}: {counts}."
 

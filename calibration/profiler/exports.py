@@ -378,10 +378,10 @@ def _of_heights(heights: list[Floats], name: str, pitch_mm: float | None, form: 
     if pitch_mm is None:
         raise InputError(
             f"'{name}' holds {len(heights)} profiles of {len(heights[0])} heights and no x. Give the distance of the"
-            " points with --pitch MM (for example --pitch 0.0125), or write the x of each column into a first row."
+            " points in mm, for example --as pitch=0.0125, or write the x of each column into a first row."
         )
     if not 1e-6 < pitch_mm < 10.0:
-        raise InputError(f"A distance of {pitch_mm:g} mm between points cannot be used; give --pitch in mm.")
+        raise InputError(f"A distance of {pitch_mm:g} mm between points cannot be used; give --as pitch in mm.")
     raw = _is_raw(np.concatenate(heights))
     points = []
     for z in heights:

@@ -28,7 +28,7 @@ _POSE_ENDINGS = (*ENDINGS, ".rob")
 _MILLIMETRES = 10.0  # a median distance of the flange above it is in millimetres
 _WIDE = 1.0  # a laser line of more than this is in millimetres
 _MOST_FILES = 20_000
-_OPTION = "--robot-form"
+_OPTION = "--as robot-form"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -98,7 +98,7 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
         raise InconsistentData(
             f"No reading of the poses fits the profiles: the best of {len(readings)}, {readings[order[0]].words},"
             f" leaves {_mm(best)} of one {what}. Check that each profile has its own pose and shows the target, or"
-            " state the form with --robot-form."
+            " state the form with --as robot-form=FORM."
         )
     limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * (len(readings) - 1)), best.dof, best.dof)))
     firm = [k for k in order if not readings[k].doubted]
@@ -111,8 +111,8 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
         raise InconsistentData(
             f"The profiles do not show how the poses are written: read as {one.words} they leave {_mm(best)} of one"
             f" {what}, as {other.words} {_mm(fits[rivals[0]])}, and the results differ. State the right one with"
-            f" --robot-form {one.form} or --robot-form {other.form}, or take more scans with the flange turned about"
-            " other axes."
+            f" --as robot-form={one.form} or --as robot-form={other.form}, or take more scans with the flange turned"
+            " about other axes."
         )
     dead = [k for k in order if k not in alive]
     chosen = min(alive)  # the usual one of those that are the same

@@ -126,8 +126,8 @@ def read_wire_touches(
     if rivals and must_decide:
         raise InputError(
             f"The touches do not show how the poses are written: as {best[1]} they leave {best[3].rms_mm:.2f} mm, as"
-            f" {rivals[0][1]} {rivals[0][3].rms_mm:.2f} mm. State it with --robot-form {best[0]} or --robot-form"
-            f" {rivals[0][0]}."
+            f" {rivals[0][1]} {rivals[0][3].rms_mm:.2f} mm. State it with --as robot-form={best[0]} or --as"
+            f" robot-form={rivals[0][0]}."
         )
     chosen = usual if usual in rivals else best
     return tuple(chosen[2]), chosen[1]
@@ -158,7 +158,7 @@ def find_tcp(touches: Sequence[WireTouch]) -> TouchedTcp:
     if wire.rms_m > _APART_M:
         raise ToolNotFound(
             f"The touches disagree by {1e3 * wire.rms_m:.0f} mm (rms), which no TCP explains: check that all are of one"
-            " point, and state how the poses are written with --unit and --robot-form."
+            " point, and state how the poses are written with --unit and --as robot-form=FORM."
         )
     held = np.full(len(touches), np.nan)
     for k, t in enumerate(touches):

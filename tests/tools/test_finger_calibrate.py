@@ -13,6 +13,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
+from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import read_finger_file
@@ -20,7 +21,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import CharucoBoard, board_sheet, write_board
+from weldcal.tools.commands.cell.board import CharucoBoard, described_sheet, write_board
 from weldcal.welding.finger.calibration import calibrate_tip
 from weldcal.welding.finger.deformation import TagLimits, TagModel, detect_tag, tag_cells
 
@@ -63,8 +64,8 @@ def drawn(texture: np.ndarray, pixels_per_m: float, X_KP: RigidTransform, number
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sixteen pictures of the board, one of which shows nothing, and the board's description."""
-    folder = tmp_path_factory.mktemp("finger")
-    write_board(folder, board_sheet(BOARD, "A5"), BOARD)
+    folder, described = tmp_path_factory.mktemp("finger"), parse_board("charuco:8x6:4:3:4X4_50")
+    write_board(folder, described_sheet(described, "A5"), described)
     scale = 40  # pixels of the print per mm
     square = int(BOARD.square_mm * scale)
     texture = BOARD.opencv().generateImage((BOARD.columns * square, BOARD.rows * square), marginSize=0, borderBits=1)

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import PAPERS, CharucoBoard, board_sheet, described_sheet, tag_sheet
+from weldcal.tools.commands.cell.board import PAPERS, CharucoBoard, described_sheet, tag_sheet
 from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600
@@ -83,22 +83,18 @@ class Page:
 
 @pytest.mark.parametrize(
     ("board", "paper"),
-    [
-        (CharucoBoard(), "A4"),
-        (CharucoBoard(11, 8, 15.0, 11.0, "5X5_50"), "A4"),
-        (CharucoBoard(5, 7, 30.0, 22.5), "A3"),
-        (CharucoBoard(7, 6, 7.3, 5.1), "A5"),
-    ],
+    [("8x6:4:3:4X4_50", "A4"), ("11x8:15:11:5X5_50", "A4"), ("5x7:30:22.5:4X4_50", "A3"), ("7x6:7.3:5.1:4X4_50", "A5")],
 )
-def test_the_squares_of_a_board_have_their_size(board: CharucoBoard, paper: str) -> None:
-    page = Page(board_sheet(board, paper).pdf())
+def test_the_squares_of_a_board_have_their_size(board: str, paper: str) -> None:
+    described = parse_board(f"charuco:{board}")
+    page = Page(described_sheet(described, paper).pdf())
     assert (page.width_mm, page.height_mm) == pytest.approx(PAPERS[paper], abs=0.01)
-    corners, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv()).detectBoard(page.picture)
+    corners, ids, _, markers = cv2.aruco.CharucoDetector(described.opencv).detectBoard(page.picture)
     assert corners is not None
-    assert len(corners) == (board.columns - 1) * (board.rows - 1)
-    assert len(markers) == board.columns * board.rows // 2
+    assert len(corners) == (described.columns - 1) * (described.rows - 1)
+    assert len(markers) == described.columns * described.rows // 2
     found = corners.reshape(-1, 2) / PIXELS_PER_MM
-    expected = 1e3 * board.opencv().getChessboardCorners()[ids.ravel(), :2]
+    expected = 1e3 * described.opencv.getChessboardCorners()[ids.ravel(), :2]
     offset = found - expected
     # in every direction and all over the board, to a fifth of a pixel of 0.04 mm
     assert np.abs(offset - offset.mean(axis=0)).max() < 0.02
@@ -129,7 +125,7 @@ def test_a_tag_has_its_size_and_its_number() -> None:
 
 
 def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
-    page = Page(board_sheet(CharucoBoard(), "A4").pdf())
+    page = Page(described_sheet(parse_board("charuco:8x6:4:3:4X4_50"), "A4").pdf())
     lengths = [np.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in page.lines]
     assert max(lengths) == pytest.approx(100.0, abs=1e-3)
     assert "This line is 100 mm long" in page.text
@@ -139,13 +135,13 @@ def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: board_sheet(CharucoBoard(20, 20, 15.0, 10.0, "4X4_100"), "A4"), "has 100 markers"),
+        (lambda: CharucoBoard(20, 20, 15.0, 10.0, "4X4_100"), "has 100 markers"),
         (
-            lambda: board_sheet(CharucoBoard(8, 6, 40.0, 30.0), "A4"),
+            lambda: described_sheet(parse_board("charuco:8x6:40:30:4X4_50"), "A4"),
             "320 x 240 mm do not fit on A4, whose printable area is 186 x 239 mm",
         ),
         (lambda: CharucoBoard(8, 6, 4.0, 4.0), "smaller than its squares"),
-        (lambda: board_sheet(CharucoBoard(), "B5"), "There is no paper 'B5'"),
+        (lambda: described_sheet(parse_board("tag:7:10:4X4_50"), "B5"), "There is no paper 'B5'"),
         (lambda: tag_sheet([TagModel("4X4_50", 7, 0.3)], "A4"), "do not fit on A4"),
     ],
 )
@@ -156,16 +152,15 @@ def test_what_cannot_be_printed_is_a_sentence(make: object, said: str) -> None:
 
 def test_the_command_writes_the_page_and_the_boards_numbers(tmp_path: Path) -> None:
     runner = CliRunner()
-    done = runner.invoke(
-        app, ["print-board", "--square-mm", "5", "--marker-mm", "3.5", "--out", str(tmp_path), "--json"]
-    )
+    done = runner.invoke(app, ["print-board", "charuco:8x6:5:3.5:4X4_50", "--out", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["state"] == "done"
     assert yaml.safe_load((tmp_path / "board.yaml").read_text())["board"]["square_mm"] == 5.0
     assert Page((tmp_path / "board.pdf").read_bytes()).width_mm == pytest.approx(210.0, abs=0.01)
-    done = runner.invoke(app, ["print-board", "tags", "--ids", "seven", "--out", str(tmp_path)])
-    assert done.exit_code == 1
+    for board, code in (("tag:7:10:4X4_50", 0), ("chessboard:9x6:20", 1)):
+        done = runner.invoke(app, ["print-board", board, "--copies", "6", "--out", str(tmp_path / board[:3])])
+        assert done.exit_code == code, done.output
 
 
 @pytest.mark.parametrize(

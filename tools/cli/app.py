@@ -1,5 +1,6 @@
 """The command line: every command that is found, in its group, in the order of the help text."""
 
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 import typer.main
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from weldcal.systems.interrupts import answer_signals
 from weldcal.tools import console
@@ -79,8 +80,24 @@ class LazyCommands(MutableMapping[str, Any]):
 def _typer_command(name: str, entry: Entry) -> Any:
     found = entry.load()
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    alone.command(name, short_help=entry.short_help, hidden=entry.hidden)(found.function)
+    kind = type("KeyedCommand", (KeyedCommand,), {"keys": found.keys})
+    alone.command(name, cls=kind, short_help=entry.short_help)(found.function)
     return typer.main.get_command(alone)
+
+
+class KeyedCommand(TyperCommand):
+    """A command that names the key of --as for an option that became one."""
+
+    keys: ClassVar[tuple[str, ...]] = ()
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuses an earlier option with the words that take its place, as wrong usage."""
+        for after, word in enumerate(args, 1):
+            name, attached, value = word.partition("=")
+            if name.startswith("--") and name[2:] in self.keys:
+                value = value if attached else "yes" if name == "--motions" else "".join(args[after : after + 1])
+                ctx.fail(f"The option {name} is a key of --as now: write --as {shlex.quote(f'{name[2:]}={value}')}.")
+        return super().parse_args(ctx, args)
 
 
 class CommandGroup(TyperGroup):
@@ -103,9 +120,7 @@ class CommandGroup(TyperGroup):
         elif args and not args[0].startswith("-") and not ctx.resilient_parsing:
             from weldcal.models.documents import nearest  # only here: an import of 80 ms
 
-            entries = self.commands.entries  # type: ignore[attr-defined]
-            shown = [name for name in self.commands if name not in entries or not entries[name].hidden]
-            near = nearest(args[0], shown)
+            near = nearest(args[0], self.commands)
             ctx.fail(f"No such command '{args[0]}'." + (f" Did you mean '{near}'?" if near else ""))
         return super().resolve_command(ctx, args)
 
@@ -118,16 +133,14 @@ class CommandGroup(TyperGroup):
         commands: LazyCommands = self.commands  # type: ignore[assignment]
         if ctx.resilient_parsing and not commands.is_made(cmd_name):
             entry = commands.entries[cmd_name]
-            return SimpleNamespace(hidden=entry.hidden, get_short_help_str=lambda *_: entry.short_help)
+            return SimpleNamespace(hidden=False, get_short_help_str=lambda *_: entry.short_help)
         return super().get_command(ctx, cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Writes the list of commands by panel, each with its whole short help."""
         entries = self.commands.entries  # type: ignore[attr-defined]
         shown = {
-            name: entries[name].short_help if name in entries else self.commands[name].help
-            for name in self.commands
-            if not (entries[name].hidden if name in entries else self.commands[name].hidden)
+            name: entries[name].short_help if name in entries else self.commands[name].help for name in self.commands
         }
         panels = dict(PANELS) if ctx.parent is None else {}
         panels["Commands"] = tuple(n for n in shown if not any(n in names for names in panels.values()))

@@ -25,7 +25,6 @@ class Entry:
 
     title: str
     short_help: str
-    hidden: bool
     module: str
 
     def load(self) -> CliCommand:
@@ -59,5 +58,4 @@ def _entries(text: str, module: str) -> Iterator[Entry]:
         call = ast.parse(f"command{decorator[1]}", mode="eval").body
         assert isinstance(call, ast.Call)
         given = {word.arg: word.value for word in call.keywords}
-        hidden = "hidden" in given and bool(ast.literal_eval(given["hidden"]))
-        yield Entry(ast.literal_eval(call.args[0]), ast.literal_eval(given["short_help"]), hidden, module)
+        yield Entry(ast.literal_eval(call.args[0]), ast.literal_eval(given["short_help"]), module)

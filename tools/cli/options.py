@@ -5,7 +5,7 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,7 +134,10 @@ class Outcome:
 
 
 class Call:
-    """One call of a command: the common options that were given, the result folder and the progress bar."""
+    """One call of a command: the common options that were given, the result folder and the progress bar.
+
+    ``reading`` holds what --as states, by key.
+    """
 
     def __init__(self, title: str, given: Mapping[str, Any], stack: ExitStack) -> None:
         self.out: Path | None = given.get("out")
@@ -142,6 +145,7 @@ class Call:
         self.json: bool = given.get("json", False)
         self.verbose: bool = given.get("verbose", False)
         self.given = given
+        self.reading: Mapping[str, Any] = given.get("as_", {})
         self.written: Path | None = None
         self._kept: list[Path] = []
         self._title, self._stack = title, stack
@@ -207,11 +211,11 @@ class Call:
 
 @dataclass(frozen=True)
 class CliCommand:
-    """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body as it is written."""
+    """A command: its full name ("tool check"), the function as Typer takes it, and the keys of its option --as."""
 
     title: str
     function: Callable[..., None]
-    body: "Body"
+    keys: tuple[str, ...] = ()
 
 
 LARGEST_OPTION = 1e6
@@ -228,6 +232,43 @@ def _check_numbers(given: Mapping[str, Any]) -> None:
             )
 
 
+_FORM, _MM = ("a form, such as euler_xyz,deg", str), ("a number of millimetres", float)
+KEYS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "robot-form": _FORM,
+    "camera-form": _FORM,
+    "intrinsics": ("a file", Path),
+    "motions": ("yes or no", {"yes": True, "no": False}.__getitem__),
+    "set": ("a name", str),
+    "trial": ("a whole number", int),
+    "pitch": _MM,
+    "side": ("left or right", {word: word for word in ("left", "right")}.__getitem__),
+    "z": ("away or towards", {word: word for word in ("away", "towards")}.__getitem__),
+    "sigma-robot": _MM,
+    "sigma-x": _MM,
+    "sigma-z": _MM,
+}
+"""Every key of --as: what its value is, and how its text is read. docs/datasets.md explains them."""
+
+
+def _read_keys(given: Iterable[str], keys: tuple[str, ...]) -> dict[str, Any]:
+    """Read the words KEY=VALUE of --as by key. Raises typer.BadParameter."""
+    found: dict[str, Any] = {}
+    for word in given:
+        key, _, text = word.partition("=")
+        if key not in keys:
+            from weldcal.models.documents import did_you_mean  # only here: an import of 80 ms
+
+            known = did_you_mean(key, keys, f"the keys of this command are {', '.join(keys)}.", 0.5)
+            raise typer.BadParameter(f"there is no key '{key}'; {known}", param_hint="'--as'")
+        what, read = KEYS[key]
+        try:
+            found[key] = {text: read(text)}[text or key]
+        except (ValueError, KeyError):
+            raise typer.BadParameter(f"{key} is {what}, not '{text}'.", param_hint="'--as'") from None
+    _check_numbers({f"as {key}": value for key, value in found.items()})
+    return found
+
+
 Body = Callable[..., Outcome | Mapping[str, object] | None]
 
 
@@ -235,17 +276,17 @@ def command(
     title: str,
     *,
     short_help: str,
-    hidden: bool = False,
+    keys: tuple[str, ...] = (),
     options: tuple[str, ...] = (),
     common: tuple[str, ...] = RESULT,
     defaults: Mapping[str, object] | None = None,
 ) -> Callable[[Body], CliCommand]:
     """Makes a command of a function body(call, own parameters ...) that returns an Outcome, a summary or None.
 
-    The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with
-    a progress bar where it reports progress. Its outcome is printed, as JSON if --json is given. The title,
-    ``short_help`` and ``hidden`` are literals: `find_commands` reads them from the module's text. ``short_help`` has at
-    most 56 characters.
+    The body gets the common options ``options`` and ``common`` through its Call, and what --as states by its ``keys``.
+    It runs inside console.boundary, with a progress bar where it reports progress. Its outcome is printed, as JSON if
+    --json is given. The title and ``short_help`` are literals: `find_commands` reads them from the module's text.
+    ``short_help`` has at most 56 characters.
     """
     names = (*options, *common)
     preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
@@ -256,7 +297,7 @@ def command(
             # A signal in Python's logging below Drake's would be lost: C++ takes the exception. Set after the import,
             # the level holds in C++ (pydrake.common, _sync_spdlog_level), and Drake's notes never come to Python.
             logging.getLogger("drake").setLevel(logging.WARNING)
-            shared = {name: given.pop(name) for name in names}
+            shared = {"as_": _read_keys(given.pop("as_", ()), keys)} | {name: given.pop(name) for name in names}
             json, debug = shared.get("json", False), shared["debug"]
             with ExitStack() as pages:
                 with console.boundary(json_wanted=json, debug=debug), work(), ExitStack() as stack:
@@ -273,10 +314,14 @@ def command(
             inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=preset[n], annotation=COMMON[n][0])
             for n in names
         ]
+        if keys:
+            words = f"How to read the file, by the keys {', '.join(keys)} (docs/datasets.md)."
+            as_ = Annotated[list[str], option("--as", "KEY=VALUE", words, show_default=False)]
+            shared.insert(0, inspect.Parameter("as_", inspect.Parameter.KEYWORD_ONLY, default=(), annotation=as_))
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
         run.__doc__ = body.__doc__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        return CliCommand(title, run, body)
+        return CliCommand(title, run, keys)
 
     return decorate
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures.boards import FORMS
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, Say, calibrate_recorded, stated_forms
 from weldcal.models.errors import WeldcalError
@@ -42,11 +43,8 @@ RobotPosesOption = Annotated[
 CameraPosesOption = Annotated[
     str | None, option("--camera-poses", "NAME", "The file, folder, array or label that holds the camera's poses.")
 ]
-_FORM = "such as euler_xyz,deg, quaternion_wxyz or matrix,inverse. Without it the data choose."
-RobotFormOption = Annotated[str | None, option("--robot-form", "FORM", f"How the robot's poses are written, {_FORM}")]
-CameraFormOption = Annotated[
-    str | None, option("--camera-form", "FORM", f"How the camera's poses are written, {_FORM}")
-]
+FORMS_OF_LISTS = ("robot-form", "camera-form")
+"""Keys of --as: how the lists of poses are written."""
 RobotOption = Annotated[
     str | None,
     option("--robot", "NAME", "The arm, for example ur10e or my_arm.urdf: the next pose is then within its reach."),
@@ -66,40 +64,40 @@ BoardOption = Annotated[
         " are inner corners.",
     ),
 ]
-IntrinsicsOption = Annotated[
-    Path | None,
-    option(
-        "--intrinsics",
-        "FILE",
-        "With --board: the file that states the camera (ROS, OpenCV, Kalibr).",
-        show_default="a camera file in the folder, else estimated",
-    ),
-]
 
 
-@command("hand-eye ax-xb", short_help="Solve AX = XB for the camera's pose.")
+def stated_lists(call: Call, robot_poses: str | None, camera_poses: str | None) -> StatedForms:
+    """Return what the options and --as state of the two lists of poses."""
+    return stated_forms(robot_poses, camera_poses, *(call.reading.get(key) for key in FORMS_OF_LISTS))
+
+
+@command(
+    "hand-eye ax-xb",
+    keys=("robot-form", "camera-form", "intrinsics", "motions"),
+    short_help="Solve AX = XB for the camera's pose.",
+)
 def ax_xb(
     call: Call,
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
     robot: JointsOfOption = None,
-    motions: Annotated[bool, switch("--motions", "The file holds motions (A and B of A X = X B), not poses.")] = False,
     robot_poses: RobotPosesOption = None,
     camera_poses: CameraPosesOption = None,
-    robot_form: RobotFormOption = None,
-    camera_form: CameraFormOption = None,
     board: BoardOption = None,
-    intrinsics: IntrinsicsOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
-    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    known = HandEyeOptions(mounting=mounting, unit=unit, robot=robot, stated=stated, board=board, intrinsics=intrinsics)
-    return _solve(call, file, replace(known, equation="ax-xb", motions=motions), limit_mm)
+    stated = stated_lists(call, robot_poses, camera_poses)
+    known = HandEyeOptions(mounting=mounting, unit=unit, robot=robot, stated=stated, board=board)
+    return _solve(call, file, replace(known, equation="ax-xb"), limit_mm)
 
 
-@command("hand-eye ax-yb", short_help="Solve AX = YB for the poses of camera and target.")
+@command(
+    "hand-eye ax-yb",
+    keys=("robot-form", "camera-form", "intrinsics"),
+    short_help="Solve AX = YB for the poses of camera and target.",
+)
 def ax_yb(
     call: Call,
     file: FileArgument,
@@ -125,15 +123,12 @@ def ax_yb(
     ] = None,
     robot_poses: RobotPosesOption = None,
     camera_poses: CameraPosesOption = None,
-    robot_form: RobotFormOption = None,
-    camera_form: CameraFormOption = None,
     board: BoardOption = None,
-    intrinsics: IntrinsicsOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
-    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    known = HandEyeOptions(mounting=mounting, unit=unit, robot=robot, stated=stated, board=board, intrinsics=intrinsics)
+    stated = stated_lists(call, robot_poses, camera_poses)
+    known = HandEyeOptions(mounting=mounting, unit=unit, robot=robot, stated=stated, board=board)
     asked = replace(known, camera=camera, corners=corners, refine=refine, kinematics=kinematics)
     return _solve(call, file, asked, limit_mm)
 
@@ -156,6 +151,7 @@ def axb_ycz(
 def _solve(call: Call, file: Path, asked: HandEyeOptions, limit_mm: float | None) -> Outcome:
     """Solve, and say how the file was read, also where it is refused."""
     said: list[str] = []
+    asked = replace(asked, **{key: call.reading[key] for key in ("intrinsics", "motions") if key in call.reading})
     folder = call.folder("hand-eye", file.resolve().stem)
     try:
         report = run_hand_eye(file, folder, replace(asked, seed=call.seed), limit_mm=limit_mm, say=said.append)

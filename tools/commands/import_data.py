@@ -20,7 +20,6 @@ from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
-from weldcal.calibration.recorded_hand_eye import stated_forms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic, write_npz
@@ -28,13 +27,12 @@ from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, FlangeOption, Outcome, command
 from weldcal.tools.cli.result_folder import RUNNING
 from weldcal.tools.commands.hand_eye import (
-    CameraFormOption,
     CameraPosesOption,
     JointsOfOption,
     MountingOption,
-    RobotFormOption,
     RobotPosesOption,
     UnitOption,
+    stated_lists,
 )
 from weldcal.tools.commands.verify_pairs import holds_scans
 from weldcal.tools.report.render import csv_text
@@ -67,7 +65,9 @@ class Imported:
         }
 
 
-@command("import", short_help="Write poses, pairs or scans of any form as a dataset.")
+@command(
+    "import", keys=("robot-form", "camera-form"), short_help="Write poses, pairs or scans of any form as a dataset."
+)
 def import_(
     call: Call,
     sources: Annotated[
@@ -85,8 +85,6 @@ def import_(
     unit: UnitOption = None,
     robot_poses: RobotPosesOption = None,
     camera_poses: CameraPosesOption = None,
-    robot_form: RobotFormOption = None,
-    camera_form: CameraFormOption = None,
     flange: FlangeOption = None,
     robot: JointsOfOption = None,
 ) -> Outcome:
@@ -94,7 +92,7 @@ def import_(
 
     Pairs become pairs.npz (A, B in m) and table.csv. Scans become poses.csv, clouds/ and dataset.yaml.
     """
-    stated = replace(stated_forms(robot_poses, camera_poses, robot_form, camera_form), arm=robot)
+    stated = replace(stated_lists(call, robot_poses, camera_poses), arm=robot)
     folder = call.folder("import", sources[0].resolve().stem)
     if folder.is_dir() and any(one.name not in ("UNFINISHED", RUNNING) for one in folder.iterdir()):
         raise InputError(f"'{folder}' is not empty: choose another folder with --out.")

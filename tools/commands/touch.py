@@ -80,7 +80,7 @@ class LiveTouches:
         return found | self.timing
 
 
-def touching(name: str, result: Path, points: int | None = None) -> Scenario:
+def touching(name: str, result: Path) -> Scenario:
     """Return a scenario of a weld as one whose robot touches the part, to judge ``result``.
 
     Raises:
@@ -90,10 +90,7 @@ def touching(name: str, result: Path, points: int | None = None) -> Scenario:
     if not hasattr(scenario, "touch"):
         raise InputError("This installation has no touch job.")
     scenario.job.calibrate = scenario.job.weld = False
-    config = TouchConfig(result=str(result))
-    if points is not None:
-        config.points = points
-    scenario.touch = config
+    scenario.touch = TouchConfig(result=str(result))
     use_kinematics(scenario, result)
     check_scenario(scenario)
     return scenario
@@ -139,12 +136,12 @@ def touches_outcome(call: Call, result: Path, touches: Path) -> Outcome:
     )
 
 
-def live_touches_outcome(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
+def live_touches_outcome(call: Call, result: Path, scenario: str, robot: str) -> Outcome:
     """What `weldcal verify --scenario` prints of points that its robot touches."""
     options = RunOptions(
         scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live
     )
-    found = run_touches(touching(scenario, result, points), options, call.progress)
+    found = run_touches(touching(scenario, result), options, call.progress)
     report = found.report
     return Outcome(
         found.summary(),

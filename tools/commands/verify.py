@@ -21,7 +21,6 @@ from weldcal.calibration.eye_on_base.validation import offset_from, position_err
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.recorded_hand_eye import stated_forms
 from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
@@ -31,13 +30,11 @@ from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
 from weldcal.tools.commands.hand_eye import (
     BoardOption,
-    CameraFormOption,
     CameraPosesOption,
-    IntrinsicsOption,
     MountingOption,
-    RobotFormOption,
     RobotPosesOption,
     UnitOption,
+    stated_lists,
 )
 from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
 from weldcal.tools.console import Progress
@@ -61,6 +58,7 @@ _UNCORRECTED = (
 
 @command(
     "verify",
+    keys=("robot-form", "camera-form", "intrinsics"),
     options=("browser", "share"),
     defaults={"browser": False},
     short_help="Verify a calibration on scans that it did not use.",
@@ -99,7 +97,6 @@ def verify(
     robot: Annotated[
         str | None, option("--robot", "NAME", "The arm of joint angles; with --scenario: simulated or an address ...")
     ] = None,
-    points: Annotated[int, option("--points", "N", "With --scenario: places to touch.", min=3, max=60)] = 8,
     flange: FlangeOption = None,
     scanner_correction: CorrectionOption = True,
     limit_mm: Annotated[
@@ -118,10 +115,7 @@ def verify(
     unit: UnitOption = None,
     robot_poses: RobotPosesOption = None,
     camera_poses: CameraPosesOption = None,
-    robot_form: RobotFormOption = None,
-    camera_form: CameraFormOption = None,
     board: BoardOption = None,
-    intrinsics: IntrinsicsOption = None,
 ) -> Outcome:
     """Verify a calibration on scans, pairs of poses or pictures that it did not use: a verdict, and the error of each.
 
@@ -136,18 +130,13 @@ def verify(
     if touch is not None or scenario is not None:
         from weldcal.tools.commands.touch import live_touches_outcome, touches_outcome
     if scenario is not None:
-        return live_touches_outcome(call, result, scenario, robot or "simulated", points)
+        return live_touches_outcome(call, result, scenario, robot or "simulated")
     if touch is not None or dataset is None:
         assert touch is not None
         return touches_outcome(call, result, touch)
-    of_pairs = {
-        "--unit": unit,
-        "--robot-poses": robot_poses,
-        "--camera-poses": camera_poses,
-        "--robot-form": robot_form,
-        "--camera-form": camera_form,
-        "--intrinsics": intrinsics,
-    }
+    named = {"--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses}
+    of_pairs = [(name, value) for name, value in named.items() if value is not None]
+    of_pairs += [("--as", f"{key}={value}") for key, value in call.reading.items()]
     if board is not None or not holds_scans(dataset):
         paired = verify_on_pairs(
             result,
@@ -158,16 +147,14 @@ def verify(
             pose=pose,
             limit_mm=limit_mm,
             board=board,
-            intrinsics=intrinsics,
-            stated=replace(stated_forms(robot_poses, camera_poses, robot_form, camera_form), arm=robot),
+            intrinsics=call.reading.get("intrinsics"),
+            stated=replace(stated_lists(call, robot_poses, camera_poses), arm=robot),
             seed=call.seed,
-            options=tuple(
-                word for name in of_pairs if of_pairs[name] for word in (name, shlex.quote(f"{of_pairs[name]}"))
-            ),
+            options=tuple(word for name, value in of_pairs for word in (name, shlex.quote(value))),
         )
         return Outcome(paired.summary(), values={}, rows=paired.rows(), first=paired.first)
-    surplus = next((name for name, value in {**of_pairs, "--mounting": mounting}.items() if value is not None), None)
-    if surplus is not None:
+    if of_pairs or mounting is not None:
+        surplus = of_pairs[0][0] if of_pairs else "--mounting"
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
     report = verify_dataset(
         result,

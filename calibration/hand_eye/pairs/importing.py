@@ -107,8 +107,8 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
     robot = robot.of_arm(stated.arm)
     _check_own(robot, camera)
-    robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
-    camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
+    robot = robot.stated(_with_name(robot, stated.robot), "--as robot-form")
+    camera = camera.stated(_with_name(camera, stated.camera), "--as camera-form")
     known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
     notes: list[str] = []
     paired = ""
@@ -145,7 +145,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         if len(a) > 1 or len(b) > 1:
             notes.append(
                 f"{n} pairs do not show how the poses are written; they were read as {A.words} and {B.words}. State it"
-                " with --robot-form and --camera-form."
+                " with --as robot-form=FORM and --as camera-form=FORM."
             )
         units = _units(A, B, robot, camera, None, stated, source)
     else:
@@ -322,8 +322,8 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
             raise InconsistentPoses(
                 f"The poses of '{source}' contradict each other in every known convention. The best is"
                 f" {_pair_words(best)}, {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that"
-                " row k of both lists was recorded at the same moment. Or state the conventions with --robot-form and"
-                " --camera-form."
+                " row k of both lists was recorded at the same moment. Or state the conventions with"
+                " --as robot-form=FORM and --as camera-form=FORM."
             )
         return
     if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
@@ -331,14 +331,14 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
         raise InconsistentPoses(
             f"With --mounting {mounting} the robot poses of '{source}' contradict the pictures. Two corrections fit"
             f" equally well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), or the robot poses"
-            f" are inverted (--robot-form {form}). Give the option that is true."
+            f" are inverted (--as robot-form={form}). Give the option that is true."
         )
     if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         raise InconsistentPoses(
             f"With --mounting {mounting} the poses of '{source}' contradict each other. Three corrections fit equally"
             f" well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), the robot poses are"
-            f" inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are inverted"
-            f" (--camera-form {_option(best.camera, 'inverse')}). Give the option that is true."
+            f" inverted (--as robot-form={_option(best.robot, 'inverse')}), or the camera poses are inverted"
+            f" (--as camera-form={_option(best.camera, 'inverse')}). Give the option that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
@@ -355,7 +355,7 @@ def _option(reading: PoseReading, change: str) -> str:
 
 
 def _options(one: ReadingAgreement) -> str:
-    return f"--robot-form {one.robot.form} --camera-form {one.camera.form}"
+    return f"--as robot-form={one.robot.form} --as camera-form={one.camera.form}"
 
 
 def _pair_words(one: ReadingAgreement) -> str:

@@ -285,13 +285,13 @@ def _estimate(
     for _ in range(4):
         kept = [k for k, p in enumerate(pictures) if not p.why]
         if len(kept) < FEWEST:
-            raise DatasetError("Fewer than four pictures fit one camera: give the camera with --intrinsics FILE.")
+            raise DatasetError("Fewer than four pictures fit one camera: give the camera with --as intrinsics=FILE.")
         obj = [board.points[np.isfinite(pictures[k].points[:, 0])].astype(np.float32) for k in kept]
         img = [pictures[k].points[np.isfinite(pictures[k].points[:, 0])].astype(np.float32) for k in kept]
         try:
             found = cv2.calibrateCameraExtended(obj, img, size, start.copy(), np.zeros(5), flags=flags)
         except cv2.error as problem:
-            raise DatasetError("The pictures do not show one camera: give it with --intrinsics FILE.") from problem
+            raise DatasetError("The pictures do not show one camera: give it with --as intrinsics=FILE.") from problem
         error = np.ravel(found[7])
         bad = error > GROSS * float(np.median(error)) + 0.3
         if not bad.any():
@@ -310,7 +310,7 @@ def _estimate(
         raise DatasetError(
             f"The camera cannot be estimated from these pictures: a focal length of {K[0, 0]:.0f} px for pictures"
             f" {size[0]} pixels wide is impossible. Tilt the board by 20 to 40 degrees in some pictures, or give the"
-            " camera with --intrinsics FILE."
+            " camera with --as intrinsics=FILE."
         )
     return K, dist, free.astype(np.int64), pictures
 

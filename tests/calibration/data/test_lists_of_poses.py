@@ -95,7 +95,7 @@ def test_a_stated_form_holds_for_one_order_of_position_and_rotation(tmp_path: Pa
     (found,) = lists_of_text(rows + "\n", "a.txt")
     assert len(found.numbers) == 2  # the rotation may come first
     for form, turn in (("rotation_vector,deg", TURN), ("euler_xyz,deg", Rotation.from_euler("xyz", V))):
-        (reading,) = found.stated(PoseForm(rotation=form), "--robot-form").readings
+        (reading,) = found.stated(PoseForm(rotation=form), "--as robot-form").readings
         assert pytest.approx(turn.as_matrix(), abs=1e-6) == reading.X[:, :3, :3]
 
 

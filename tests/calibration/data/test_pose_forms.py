@@ -230,7 +230,7 @@ def test_a_form_that_states_no_convention_keeps_every_reading(scans: Path, case:
 def test_radians_called_degrees_and_a_wrong_unit_are_named(scans: Path) -> None:
     (scans / "poses.txt").write_text(rows(P, TURN.as_rotvec()))
     described(scans, "{angles: deg}")
-    with pytest.raises(DatasetError, match=r"look like radians; state rad: 'poses: {angles: rad}' in dataset\.yaml"):
+    with pytest.raises(DatasetError, match=r"look like radians. State rad by 'poses: {angles: rad}' in dataset\.yaml"):
         load_dataset(scans)
     described(scans, "{}", "{clouds: m, poses: mm}")
     with pytest.raises(DatasetError, match="look like m; correct units"):

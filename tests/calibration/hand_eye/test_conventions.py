@@ -97,7 +97,8 @@ def test_an_inverted_list_is_refused_with_the_three_ways_to_state_it(tmp_path: P
     A, B, _ = world(np.random.default_rng(2), 12, degrees=0.05, mm=0.3)
     np.savez(tmp_path / "a.npz", A=np.linalg.inv(A), B=B)
     with pytest.raises(
-        InconsistentPoses, match=r"--mounting eye_on_base.*--robot-form matrix,inverse.*--camera-form matrix,inverse"
+        InconsistentPoses,
+        match=r"--mounting eye_on_base.*--as robot-form=matrix,inverse.*--as camera-form=matrix,inverse",
     ):
         read_pairs(tmp_path / "a.npz", mounting="eye_in_hand")
     assert read_pairs(tmp_path / "a.npz", mounting="eye_on_base").robot == pytest.approx(np.linalg.inv(A), abs=1e-12)

@@ -301,7 +301,7 @@ def test_a_wrong_size_of_squares_is_named_with_the_right_one(chess: tuple[Path, 
 
 def test_the_wrong_mounting_is_refused_with_both_options(chess: tuple[Path, draw.World], once: None) -> None:
     with pytest.raises(
-        InconsistentPoses, match=r"--mounting eye_in_hand\), or the robot poses are inverted \(--robot-form"
+        InconsistentPoses, match=r"--mounting eye_in_hand\), or the robot poses are inverted \(--as robot-form"
     ):
         read_pictures(chess[0], parse_board("chessboard:9x6:20"), mounting="eye_on_base")
 

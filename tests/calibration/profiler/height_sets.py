@@ -170,7 +170,7 @@ def tried(made: ProfileSet, folder: Path, *more: object) -> tuple[str, str]:
         verdict = "right" if np.median(off) < 0.3 and np.percentile(off, 90) < 1.0 else "wrong"
         told = got.get("z_grows", "?")
         return (verdict if told == sign else "wrong"), f"{np.median(off):.3f} mm of {len(p)} points, z {told}"
-    words = ["edge", files, "--feature", FEATURE[made.part], "--side", made.side, "--out", folder / "out"]
+    words = ["edge", files, "--feature", FEATURE[made.part], "--as", f"side={made.side}", "--out", folder / "out"]
     got, said = _called(*words, *more)
     if not got:
         return "refused", said

@@ -98,7 +98,9 @@ def test_a_sphere_with_touches_by_both_methods_and_what_was_written_is_read_back
         "radius": d.radius_m, "touch_T": touch_T, "tip": d.tip, "sign": trial.sign,
     }  # fmt: skip
     np.savez(tmp_path / "s.npz", **content)
-    joint = found("sphere", tmp_path / "s.npz", "--model", "rigid", "--sigma-robot", 0.04, "--out", tmp_path / "joint")
+    joint = found(
+        "sphere", tmp_path / "s.npz", "--model", "rigid", "--as", "sigma-robot=0.04", "--out", tmp_path / "joint"
+    )
     assert joint["reduced_chi2"] == pytest.approx(1.0, abs=0.15)
     record = load_record(tmp_path / "joint")
     assert np.linalg.norm(record.translation - world.translation) < 1e-3
@@ -164,7 +166,7 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
             ("edge", "flat.csv", "--feature", "step"),
             "None of the 8 profiles shows the feature step with its near face on the left, with z away from the sensor or",
         ),
-        (("edge", "e.csv", "--sigma-x", "0"), "must be positive"),
+        (("edge", "e.csv", "--as", "sigma-x=0"), "must be positive"),
         (("edge", "bad.csv"), "has the columns a, b: no x and z of profile points. Name them px_mm and pz_mm"),
         (("edge", "word.csv"), "not a number"),
         (("sphere", "e.csv"), "no 'profiles' of the sphere"),

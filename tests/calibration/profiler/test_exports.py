@@ -191,8 +191,8 @@ FORMS: dict[str, tuple[Callable[[World], str], tuple[str, ...]]] = {
     "heights_with_x.csv": (heights_with_x, ()),
     "heights_in_columns.txt": (heights_in_columns, ()),
     "named_columns.csv": (named_columns, ()),
-    "heights_only.csv": (heights_only, ("--pitch", str(PITCH))),
-    "heights_in_lines.txt": (heights_in_lines, ("--pitch", str(PITCH))),
+    "heights_only.csv": (heights_only, ("--as", f"pitch={PITCH}")),
+    "heights_in_lines.txt": (heights_in_lines, ("--as", f"pitch={PITCH}")),
     "raw_integers.txt": (raw_integers, ()),
 }
 
@@ -383,9 +383,9 @@ def test_heights_without_x_are_refused_with_two_ways_that_work(tmp_path: Path) -
     source.write_text(heights_only(world()))
     code, text, _ = run("sphere", source, "--radius", RADIUS)
     assert code == 1, text
-    assert "--pitch" in text
+    assert "--as pitch=" in text
     assert "first row" in text
-    check(sphere(source, "--pitch", PITCH))
+    check(sphere(source, "--as", f"pitch={PITCH}"))
     source.write_text(heights_with_x(world()))
     check_poses(read(source))
 
@@ -421,9 +421,16 @@ def test_unnamed_columns_are_refused_with_an_example_that_works(tmp_path: Path) 
 def test_a_stated_form_wins_and_a_wrong_one_does_not_calibrate(tmp_path: Path) -> None:
     (tmp_path / "export.csv").write_text(gocator_raw(world()), newline="")
     (tmp_path / "poses.txt").write_text(bare_wpr(world()))
-    check(sphere(tmp_path / "export.csv", "--robot-form", "euler_xyz,deg"))
+    check(sphere(tmp_path / "export.csv", "--as", "robot-form=euler_xyz,deg"))
     code, text, _ = run(
-        "sphere", tmp_path / "export.csv", "--radius", RADIUS, "--robot-form", "euler_XYZ,deg", "--out", tmp_path / "no"
+        "sphere",
+        tmp_path / "export.csv",
+        "--radius",
+        RADIUS,
+        "--as",
+        "robot-form=euler_XYZ,deg",
+        "--out",
+        tmp_path / "no",
     )
     assert code != 0, text
 
@@ -461,7 +468,7 @@ def test_two_readings_that_agree_are_refused_by_name(tmp_path: Path) -> None:
     def alike(poses: FlangePoses) -> ReadingFit:
         return ReadingFit(np.full(SCANS, 1e-9), 3, 9, poses.rotation[0], np.zeros(3))
 
-    with pytest.raises(InconsistentData, match="--robot-form quaternion_xyzw or --robot-form quaternion_wxyz"):
+    with pytest.raises(InconsistentData, match="--as robot-form=quaternion_xyzw or --as robot-form=quaternion_wxyz"):
         choose_reading(found.readings, alike, "sphere")
     check_poses(read(tmp_path / "export.csv", form="quaternion_xyzw"))
 

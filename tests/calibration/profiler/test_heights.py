@@ -59,7 +59,7 @@ def test_the_level_of_the_residuals_is_that_of_f() -> None:
 
 def test_signs_that_explain_alike_are_asked_for_or_agree() -> None:
     both = {"away": fit(20, 20), "towards": fit(20, 20, 0.8)}
-    with pytest.raises(InconsistentData, match="--z away or --z towards"):
+    with pytest.raises(InconsistentData, match="--as z=away or --as z=towards"):
         choose_sign(both, 20, "bar", never)
     assert choose_sign(both, 20, "bar", lambda: True)[0] == "towards"
     assert choose_sign({"away": both["away"]}, 20, "bar", never)[0] == "away"
@@ -80,15 +80,15 @@ def test_refusals_count_the_profiles() -> None:
 
 def test_a_stated_sign_is_used(tmp_path: Path) -> None:
     made = profile_set(np.random.default_rng(8), "ridge", True, views=10)
-    assert tried(made, tmp_path / "right", "--z", "towards")[0] in ("right", "wide")
+    assert tried(made, tmp_path / "right", "--as", "z=towards")[0] in ("right", "wide")
     files = write_folder(made, tmp_path / "p")
-    found, said = _called("edge", files, "--feature", "apex", "--z", "away", "--out", tmp_path / "o")
+    found, said = _called("edge", files, "--feature", "apex", "--as", "z=away", "--out", tmp_path / "o")
     assert not found
     assert "None of the 10 profiles shows the feature apex" in said
     assert "with z away from the sensor." in said
     assert (
-        "--z away or --z towards, not 'up'"
-        in _called("edge", files, "--feature", "apex", "--z", "up", "--out", tmp_path / "o")[1]
+        "z is away or towards, not 'up'"
+        in _called("edge", files, "--feature", "apex", "--as", "z=up", "--out", tmp_path / "o")[1]
     )
 
 
@@ -99,8 +99,8 @@ def test_a_step_with_the_wrong_side_is_asked_about(heights: bool, tmp_path: Path
     verdict, said = tried(replace(made, side=other), tmp_path / "wrong")
     sign = "towards" if heights else "away"
     assert verdict == "refused"
-    assert f"--side {made.side} --z {sign}" in said
-    assert tried(made, tmp_path / "right", "--z", sign)[0] in ("right", "wide")
+    assert f"--as side={made.side} --as z={sign}" in said
+    assert tried(made, tmp_path / "right", "--as", f"z={sign}")[0] in ("right", "wide")
 
 
 def test_a_seam_of_the_other_sign_than_its_calibration_is_refused(tmp_path: Path) -> None:

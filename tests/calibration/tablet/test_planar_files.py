@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from tests.worlds.tablet import TabletTrial, simulate_trial
 from weldcal.calibration.tablet.planar_files import load_planar
-from weldcal.calibration.tablet.published import Sign
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
 
@@ -83,7 +82,7 @@ def fitted(path: Path, d: Fields) -> VisitFits:
     """The fits of a file with these fields, without the command's report; hands are taken as they are."""
     np.savez(path / "touches.npz", **d)
     (visit,) = load_planar(path / "touches.npz").visits
-    return fit_visit(visit, Sign.CORRECTED, 0.0)
+    return fit_visit(visit, 0.0)
 
 
 @lru_cache(maxsize=1)

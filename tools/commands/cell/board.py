@@ -10,7 +10,7 @@ import numpy as np
 import typer
 import yaml
 
-from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, dictionary, parse_board
+from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, FORMS, dictionary, parse_board
 from weldcal.calibration.hand_eye.pictures.boards import Board as DescribedBoard
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option
@@ -30,45 +30,22 @@ Rectangle = tuple[float, float, float, float]
 @command("print-board", short_help="Write a calibration board or tags as PDF at true scale.")
 def print_board(
     call: Call,
-    kind: Annotated[
-        str,
-        typer.Argument(
-            metavar="[BOARD]", help="charuco (a board), tags, or what hand-eye --board takes: chessboard:9x6:25 ..."
-        ),
-    ] = "charuco",
-    columns: Annotated[int, option("--columns", "N", "Squares of the board across.")] = 8,
-    rows: Annotated[int, option("--rows", "N", "Squares of the board down.")] = 6,
-    square_mm: Annotated[float, option("--square-mm", "MM", "Side of a square.")] = 4.0,
-    marker_mm: Annotated[float, option("--marker-mm", "MM", "Side of a marker in a square.")] = 3.0,
-    ids: Annotated[str, option("--ids", "N,N...", "Numbers of the tags.")] = "7",
-    size_mm: Annotated[float, option("--size-mm", "MM", "Black side of a tag.")] = 10.0,
-    copies: Annotated[int, option("--copies", "N", "Copies of each tag.", min=1, max=500)] = 6,
-    dictionary: Annotated[
-        str, option("--dictionary", "NAME", "Markers: 4X4_50, 5X5_50, APRILTAG_36h11 ...")
-    ] = "4X4_50",
+    board: Annotated[
+        str, typer.Argument(metavar="[BOARD]", help=f"As hand-eye --board: {', '.join(FORMS.values())}.")
+    ] = "charuco:8x6:4:3:4X4_50",
+    copies: Annotated[int, option("--copies", "N", "Copies of a single tag.", min=1, max=500)] = 1,
     paper: Annotated[str, option("--paper", "NAME", "A5, A4, A3 or letter.")] = "A4",
 ) -> Outcome:
-    """Write a ChArUco board, or tags, as board.pdf at true scale, with a line of 100 mm to check the print by."""
-    board = None
-    if ":" in kind:
-        sheet = described_sheet(parse_board(kind), paper)
-        kind = kind.partition(":")[0]
-    elif kind == "charuco":
-        board = CharucoBoard(columns, rows, square_mm, marker_mm, dictionary)
-        sheet = board_sheet(board, paper)
-    elif kind == "tags":
-        words = ids.split(",")
-        if not all(word.strip().isdigit() for word in words):
-            raise InputError(f"--ids must be whole numbers with commas between, not '{ids}'.")
-        tags = [TagModel(dictionary, int(word), 1e-3 * size_mm) for word in words for _ in range(copies)]
-        sheet = tag_sheet(tags, paper)
+    """Write a board or a tag as board.pdf at true scale, with a line of 100 mm to check the print by."""
+    described = parse_board(board)
+    if copies == 1:
+        sheet = described_sheet(described, paper)
+    elif described.kind == "tag":
+        sheet = tag_sheet([TagModel(described.dictionary, described.id, described.size)] * copies, paper)
     else:
-        raise InputError(
-            f"There is no board of the kind '{kind}': use charuco, tags, or a description such as"
-            f" {EXAMPLES['chessboard'].split()[0]}."
-        )
-    written = write_board(call.folder("print-board", kind), sheet, board)
-    return Outcome({"state": "done", "kind": kind, **written, "note": NOTE})
+        raise InputError(f"--copies is for a single tag, such as {EXAMPLES['tag'].split()[0]}, not for '{board}'.")
+    written = write_board(call.folder("print-board", described.kind), sheet, described)
+    return Outcome({"state": "done", "kind": described.kind, **written, "note": NOTE})
 
 
 @dataclass(kw_only=True)
@@ -180,12 +157,6 @@ class CharucoBoard:
         return cv2.aruco.CharucoBoard((self.columns, self.rows), *sides, dictionary_named(self.dictionary))
 
 
-def board_sheet(board: CharucoBoard, paper: str) -> Sheet:
-    """Return the board in the middle of a page. Raises InputError where it does not fit."""
-    sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
-    return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
-
-
 def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
     """What a description of a board says, in the middle of a page, with the description.
 
@@ -265,13 +236,14 @@ def tag_sheet(tags: Iterable[TagModel], paper: str) -> Sheet:
     return sheet
 
 
-def write_board(folder: Path, sheet: Sheet, board: CharucoBoard | None) -> dict[str, str]:
-    """Write board.pdf, and board.yaml where it is a board, into a folder; returns their paths by kind."""
+def write_board(folder: Path, sheet: Sheet, board: DescribedBoard) -> dict[str, str]:
+    """Write board.pdf, and board.yaml of a ChArUco board, into a folder; returns their paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
     written = {"pdf": str(folder / "board.pdf")}
     write_atomic(folder / "board.pdf", sheet.pdf())
-    if board is not None:
-        keys = {name: getattr(board, name) for name in ("columns", "rows", "square_mm", "marker_mm", "dictionary")}
+    if board.kind == "charuco":
+        sides = {"square_mm": round(1e3 * board.size, 9), "marker_mm": round(1e3 * board.inner, 9)}
+        keys = {"columns": board.columns, "rows": board.rows, **sides, "dictionary": board.dictionary}
         write_atomic(folder / "board.yaml", yaml.safe_dump({"schema": 1, "board": keys}, sort_keys=False))
         written["board"] = str(folder / "board.yaml")
     return written

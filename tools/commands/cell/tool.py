@@ -161,16 +161,13 @@ def tool_measure(
     return Outcome(report.summary(), values={}, rows=report.rows(call.verbose))
 
 
-@command("tool tcp", short_help="Find the TCP from touches of one point.")
+@command("tool tcp", keys=("robot-form",), short_help="Find the TCP from touches of one point.")
 def tool_tcp(
     call: Call,
     file: Annotated[
         Path, typer.Argument(metavar="TOUCHES", help="Flange poses at four or more touches of one point, in any form.")
     ],
     unit: Annotated[str, option("--unit", "U", "m or mm, of the positions.", show_default="the file's")] = "auto",
-    robot_form: Annotated[
-        str, option("--robot-form", "FORM", "How the poses are written, such as rotation_vector,deg.")
-    ] = "",
     tcp: Annotated[
         str,
         option("--tcp", "X,Y,Z,RX,RY,RZ", "The TCP (mm, rad) of the poses, where it was not zero; its turn is kept."),
@@ -182,7 +179,7 @@ def tool_tcp(
     if unit not in ("auto", "m", "mm"):
         raise InputError(f"The unit is m or mm, not '{unit}'.")
     old = _six(tcp)
-    form = PoseForm(rotation=robot_form, tcp=old if tcp else [])
+    form = PoseForm(rotation=call.reading.get("robot-form", ""), tcp=old if tcp else [])
     touches, read_as = read_wire_touches(file, form, unit, must_decide=True)
     folder = call.folder("tool-tcp", file.stem)
     report = TcpReport(find_tcp(touches), touches, read_as, old[3:], limit_mm, folder)

@@ -17,7 +17,7 @@ from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.motion.line_clock import LineClock, offset_from_line
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, checked_sign, choose_sign, with_sign
+from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, choose_sign, signs_to_try, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.exports import SECONDS, TABLES, TREES, UNITS, Profiles
 from weldcal.calibration.profiler.features.groove import groove_features
@@ -29,24 +29,21 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import read_text
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
+from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.commands.profiler.result import (
     FileArgument,
-    FormOption,
-    PitchOption,
     PosesOption,
-    TrialOption,
     UnitOption,
-    ZOption,
     check_number,
     outcome_of,
+    read_measurements,
     with_warnings,
 )
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
 from weldcal.tools.report.render import csv_text, write_atomic, write_json
 
-_KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
+_KINDS = ("bar", "step", "apex")
 _STREAM, _TIMES = "stream.csv", "times.csv"
 _ALIKE = 3.0  # standard deviations within which two offsets are one
 _NEAR_S = 0.5  # offset of the clocks that is searched
@@ -54,7 +51,7 @@ _NEAR_S = 0.5  # offset of the clocks that is searched
 _SHARE = 0.01
 
 
-@command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
+@command("profiler clock", keys=("pitch", "side", "z"), short_help="Find a profiler's clock from a straight edge.")
 def clock(
     call: Call,
     folder: Annotated[
@@ -66,20 +63,18 @@ def clock(
     feature: Annotated[
         str, option("--feature", "KIND", "Where a time has many rows, the edge in them: bar, step or apex.")
     ] = "bar",
-    side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
-    pitch: PitchOption = None,
-    z: ZOption = "",
 ) -> Outcome:
     """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
     out = call.folder("profiler", folder.resolve().name)
+    side, z = call.reading.get("side", "left"), call.reading.get("z", "")
     if unit not in ("m", "mm"):
         raise InputError(f"The unit '{unit}' is not known; write m or mm.")
-    if feature not in _KINDS or side not in _SIDES:
-        raise InputError(f"The feature is one of {', '.join(_KINDS)}, and the side left or right.")
+    if feature not in _KINDS:
+        raise InputError(f"The feature is one of {', '.join(_KINDS)}, not '{feature}'.")
     record = load_record(calibration)
     source = _source(folder, {calibration.resolve(), out.resolve()})
     stream, said = read_stream(folder / _STREAM, robot=robot, unit=unit)
-    profiles = profiles_of(source, pitch)[0]
+    profiles = profiles_of(source, call.reading.get("pitch"))[0]
     motion = ContinuousMotion(stream)
     stamps, time_unit = _stamps(folder, profiles, motion)
     scale = UNITS[profile_unit(profiles, unit)]
@@ -180,7 +175,7 @@ def _offset(
 ) -> tuple[LineClock, Array, int, dict[str, str]]:
     """Find the clock's offset, the times (n,) s of the crossings, the profiles without one, and the sign of z."""
     fits, found, total = {}, {}, len(profiles)
-    for grows in checked_sign(z):
+    for grows in signs_to_try(z):
         at, lost = with_sign([scale * p for p in profiles.points], extract, grows)
         points, time = np.array(at).reshape(-1, 2), np.delete(stamps, lost)
         good = np.isfinite(points).all(axis=1) & np.isfinite(time)
@@ -222,25 +217,22 @@ def _chosen(
     return grows, {"z_grows": WORDS[grows], "z_reason": reason}
 
 
-@command("profiler seam", short_help="Map a V-groove in the base frame.")
+@command(
+    "profiler seam", keys=("robot-form", "set", "trial", "pitch", "z"), short_help="Map a V-groove in the base frame."
+)
 def seam(
     call: Call,
     file: FileArgument,
     calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
     unit: UnitOption = None,
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     limit_mm: LimitOption = None,
-    z: ZOption = "",
 ) -> Outcome:
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
     check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)
-    data = read_profiler_file(file, unit=unit, trial=trial, stated=PosesStated(poses, robot_form, pitch))
-    data = _as_calibrated(data, calibration)
-    found = with_warnings(data, map_seam(data, calibration, folder, z))
+    data = _as_calibrated(read_measurements(call, file, unit, poses), calibration)
+    found = with_warnings(data, map_seam(data, calibration, folder, call.reading.get("z", "")))
     return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
 
 
@@ -255,7 +247,7 @@ def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
         one, other = data.readings[:2]
         raise InputError(
             f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)}"
-            f" readings). State it, for example with --robot-form {one.form} or --robot-form {other.form}."
+            f" readings). State it, for example with --as robot-form={one.form} or --as robot-form={other.form}."
         )
     return data
 
@@ -268,7 +260,7 @@ def map_seam(file: Measurements, calibration: Path, folder: Path, z: str = "") -
     poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
     check_number(poses, (len(file.profiles),), "profiles")
     columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
-    found = {grows: with_sign(file.profiles, _groove, grows) for grows in checked_sign(z)}
+    found = {grows: with_sign(file.profiles, _groove, grows) for grows in signs_to_try(z)}
     fits = {g: SignFit(shown=len(at), kept=len(at), variance=1.0, freedom=len(at)) for g, (at, _) in found.items()}
     if not any(fit.shown for fit in fits.values()):
         raise FeatureNotFound(

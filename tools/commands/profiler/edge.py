@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import log_rotation
-from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, beats, checked_sign, choose_sign, with_sign
+from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, beats, choose_sign, signs_to_try, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.edge.joint import OUTLIER, EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
@@ -23,26 +23,20 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.result import believed_covariance
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
+from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
-    ROBOT_SIGMA,
-    Z_SIGMA,
     FileArgument,
-    FormOption,
-    PitchOption,
     PlanOption,
     PosesOption,
-    SetOption,
     Sigmas,
-    TrialOption,
     UnitOption,
-    ZOption,
     check_number,
     figures_of,
     finish,
     next_poses,
     outcome_of,
+    read_measurements,
     widened,
     with_warnings,
 )
@@ -56,52 +50,34 @@ SETTLED = 1.15  # residuals up to this many times the sigmas agree with them
 FOLDS = 5
 ALIKE = 0.9  # a choice: share of pairs of estimates of one pose that are closer
 
-ESTIMATED = "the file's, else estimated from the points, at least {}"
+SIGMAS_MM = {"sigma-robot": 0.03, "sigma-x": 0.05, "sigma-z": 0.06}
 
 
-@command("profiler edge", short_help="Calibrate by one straight edge.")
+@command(
+    "profiler edge",
+    keys=("robot-form", "set", "trial", "pitch", "side", "z", *SIGMAS_MM),
+    short_help="Calibrate by one straight edge.",
+)
 def edge(
     call: Call,
     file: FileArgument,
     unit: UnitOption = None,
-    dataset: SetOption = "",
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     method: Annotated[str, option("--method", "M", "joint, or paper (the published linear method).")] = "joint",
     feature: Annotated[str, option("--feature", "KIND", "For raw profiles: bar, step or apex.")] = "",
-    side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
-    z: ZOption = "",
-    sigma_robot: Annotated[
-        float | None, option("--sigma-robot", "MM", ROBOT_SIGMA, show_default=ESTIMATED.format(0.03))
-    ] = None,
-    sigma_x: Annotated[
-        float | None,
-        option(
-            "--sigma-x",
-            "MM",
-            "Standard deviation of a point along the laser line.",
-            show_default=ESTIMATED.format(0.05),
-        ),
-    ] = None,
-    sigma_z: Annotated[float | None, option("--sigma-z", "MM", Z_SIGMA, show_default=ESTIMATED.format(0.06))] = None,
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by points of one straight edge, from any poses. Needs no initial
     guess."""
     check_limit(limit_mm)
-    given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
-    r, x, depth = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
-    sigmas = Sigmas(r, x, depth, stated=any(v is not None for v in given))
-    data = read_profiler_file(
-        file, unit=unit, dataset=dataset, trial=trial, stated=PosesStated(poses, robot_form, pitch)
-    )
+    r, x, depth = (1e-3 * call.reading.get(key, usual) for key, usual in SIGMAS_MM.items())
+    sigmas = Sigmas(r, x, depth, stated=any(key in call.reading for key in SIGMAS_MM))
+    data = read_measurements(call, file, unit, poses)
     if not sigmas.stated and "sigma" in data.arrays:
         r, x, depth = (float(v) for v in data.arrays["sigma"])
         sigmas = Sigmas(r, x, depth)
-    shown = edge_shown(data, sigmas, feature, side, z)
+    shown = edge_shown(data, sigmas, feature, call.reading.get("side", "left"), call.reading.get("z", ""))
     record, found = calibrate_edge(shown, sigmas, method=method, plan=plan, seed=call.seed)
     data, held = shown.file, np.zeros(0)
     if "sigmas_mm" in found:  # the paper's method has no sigmas, and nothing is left out
@@ -151,9 +127,7 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
 
     Of raw profiles each sign of z is tried that is not excluded by ``z``.
     """
-    if side not in ("left", "right"):
-        raise InputError(f"The side is left or right, not '{side}'.")
-    signs = checked_sign(z)
+    signs = signs_to_try(z)
     if not feature:
         why = "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
         return EdgeShown(file=file, points=file.needed("points", why)).decided()
@@ -168,7 +142,7 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
         other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
         raise InputError(
             f"None of the {total} profiles shows the feature {feature} with its near face on the {side}, with z"
-            f" {' or '.join(WORDS[grows] for grows in signs)}. Try --side {other_side}, or"
+            f" {' or '.join(WORDS[grows] for grows in signs)}. Try --as side={other_side}, or"
             f" {other}."
         )
     grows, reason = choose_sign(fits, total, feature, lambda: _alike([one.fit for one, _ in tried.values()]))
@@ -180,8 +154,8 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
             raise InconsistentData(
                 f"The profiles do not show which face of the {feature} is near. With the near face on the {side} and z"
                 f" {WORDS[grows]}, {fits[grows].kept} of {total} agree on one edge. With it on the {other_side} and z"
-                f" {WORDS[opposite]}, {there.kept} agree on another. State z: --side {side} --z {grows}, or"
-                f" --side {other_side} --z {opposite}. Heights (Gocator, Keyence) grow towards the sensor."
+                f" {WORDS[opposite]}, {there.kept} agree on another. State z: --as side={side} --as z={grows}, or"
+                f" --as side={other_side} --as z={opposite}. Heights (Gocator, Keyence) grow towards the sensor."
             )
     return replace(tried[grows][0], words={"z_grows": WORDS[grows], "z_reason": reason})
 

@@ -160,7 +160,7 @@ def read_profiler_file(
     stated = stated or PosesStated()
     if path.suffix.lower() == ".npz" and not path.is_dir():
         if stated != PosesStated():
-            raise InputError("An NPZ holds its poses as T. Omit --poses, --robot-form and --pitch.")
+            raise InputError("An NPZ holds its poses as T. Omit --poses and the keys robot-form and pitch of --as.")
         arrays, profiles = _from_npz(path, unit, dataset, trial)
         file = Measurements(arrays=arrays, profiles=profiles, digest=sha256(path))
     elif stated == PosesStated() and _is_own_table(path):
@@ -251,9 +251,9 @@ def _from_npz(
     scale = UNITS[said]
     sets = sorted({name[: -len("_Rb")] for name in raw if name.endswith("_Rb")})
     if sets and dataset not in sets:
-        raise InputError(f"The file has several sets. Choose one with --set {' | '.join(sets)}.")
+        raise InputError(f"The file has several sets. Choose one with --as set={' | set='.join(sets)}.")
     if dataset and not sets:
-        raise InputError(f"The file has no sets. Omit --set {dataset}.")
+        raise InputError(f"The file has no sets. Omit --as set={dataset}.")
     if dataset:
         level = raw.get(f"sigma_{dataset.rsplit('_', 1)[-1]}")  # of the noise that the set is named after
         raw = {
@@ -306,7 +306,7 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
     if trial is None:
         if len(value) == 1:
             return np.asarray(value[0])
-        raise InputError(f"The file has {len(value)} trials. Choose one with --trial 0 to {len(value) - 1}.")
+        raise InputError(f"The file has {len(value)} trials. Choose one with --as trial=0 to {len(value) - 1}.")
     if not 0 <= trial < len(value):
         raise InputError(f"There is no trial {trial}. The file has 0 to {len(value) - 1}.")
     return np.asarray(value[trial])

@@ -19,7 +19,7 @@ from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.options import Call, Outcome, option
-from weldcal.tools.commands.profiler.files import Measurements
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report
 from weldcal.tools.report.render import write_atomic
 
@@ -34,23 +34,17 @@ UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, where the fil
 PosesOption = Annotated[
     Path | None, option("--poses", "FILE", "The flange's pose of each profile, where the export has none.")
 ]
-FormOption = Annotated[
-    str,
-    option("--robot-form", "FORM", "How the poses are written, such as euler_ZYX,deg. Without it the profiles choose."),
-]
-PitchOption = Annotated[
-    float | None, option("--pitch", "MM", "Distance of the points, where the export holds heights only.")
-]
-ZOption = Annotated[
-    str, option("--z", "SIGN", "away or towards the sensor: where z of raw profiles grows. Without it the data decide.")
-]
-SetOption = Annotated[str, option("--set", "NAME", "Which set of an NPZ with several.")]
-TrialOption = Annotated[int | None, option("--trial", "K", "Which trial or world of an NPZ with several.")]
-ROBOT_SIGMA, Z_SIGMA = "Standard deviation of the robot's position per axis.", "Standard deviation of a point in depth."
 PlanOption = Annotated[int, option("--plan", "N", "Also propose N poses to add next.", min=0)]
 RadiusOption = Annotated[float | None, option("--radius", "MM", "Radius of the sphere, if the file has none.")]
 TouchesOption = Annotated[Path | None, option("--touches", "FILE", "CSV of flange poses at touches of the sphere.")]
 TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flange frame, mm.")]
+
+
+def read_measurements(call: Call, file: Path, unit: str | None, poses: Path | None) -> Measurements:
+    """Read a file as --as states it."""
+    stated = PosesStated(poses, call.reading.get("robot-form", ""), call.reading.get("pitch"))
+    known = {"dataset": call.reading.get("set", ""), "trial": call.reading.get("trial")}
+    return read_profiler_file(file, unit=unit, **known, stated=stated)
 
 
 def with_warnings(data: Measurements, found: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,29 +27,24 @@ from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools import console
-from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
-    ROBOT_SIGMA,
-    Z_SIGMA,
     FileArgument,
-    FormOption,
-    PitchOption,
     PlanOption,
     PosesOption,
     RadiusOption,
-    SetOption,
     Sigmas,
     TipOption,
     TouchesOption,
-    TrialOption,
     UnitOption,
     check_number,
     figures_of,
     finish,
     next_poses,
     outcome_of,
+    read_measurements,
     widened,
     with_warnings,
 )
@@ -63,34 +58,31 @@ ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
 MODELS = ("auto", "rigid", "affine", "affine+joints")
 
 
-@command("profiler sphere", short_help="Calibrate by a sphere, with or without touches of it.")
+@command(
+    "profiler sphere",
+    keys=("robot-form", "set", "trial", "pitch", "sigma-robot", "sigma-z"),
+    short_help="Calibrate by a sphere, with or without touches of it.",
+)
 def sphere(
     call: Call,
     file: FileArgument,
     unit: UnitOption = None,
-    dataset: SetOption = "",
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     radius: RadiusOption = None,
     model: Annotated[str, option("--model", "M", "auto, rigid, affine or affine+joints.")] = "auto",
     arm: Annotated[str, option("--arm", "NAME", "Arm whose kinematic table is used, for example ur10e.")] = "",
     touches: TouchesOption = None,
     tip: TipOption = "",
-    sigma_robot: Annotated[float, option("--sigma-robot", "MM", ROBOT_SIGMA)] = 0.03,
-    sigma_z: Annotated[float, option("--sigma-z", "MM", Z_SIGMA)] = 0.05,
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides
     and no pure translations."""
     check_limit(limit_mm)
-    sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
+    robot_m, z_m = (1e-3 * call.reading.get(key, usual) for key, usual in (("sigma-robot", 0.03), ("sigma-z", 0.05)))
+    sigmas = Sigmas(robot_m, z_m, z_m)
     lost: list[int] = []
-    data, measured = read_sphere(
-        call, file, unit, dataset, trial, radius, touches, tip, arm, lost, PosesStated(poses, robot_form, pitch)
-    )
+    data, measured = read_sphere(call, file, unit, poses, radius, touches, tip, arm, lost)
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
     made, summary = finish_sphere(
         measured,
@@ -108,20 +100,17 @@ def read_sphere(
     call: Call,
     file: Path,
     unit: str | None,
-    dataset: str,
-    trial: int | None,
+    poses: Path | None,
     radius: float | None,
     touches: Path | None,
     tip: str,
     arm: str = "",
     lost: list[int] | None = None,
-    stated: PosesStated | None = None,
 ) -> tuple[Measurements, SphereData]:
     """Return the measurements of a sphere and its touches, with the reading of the poses that the arcs select."""
     tip_m = parse_tip(tip)
-    stated = stated or PosesStated()
-    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial, stated=stated)
-    felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=stated.form))
+    data, form = read_measurements(call, file, unit, poses), call.reading.get("robot-form", "")
+    felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=form))
     radius_m = None if radius is None else 1e-3 * radius
     lost = [] if lost is None and len(data.readings) > 1 else lost
 
@@ -339,30 +328,26 @@ def finish_sphere(
     return finish(record, found, np.vstack(data.profiles), held, source, out, limit_mm)
 
 
-@command("profiler compensate", short_help="Calibrate by the published sphere method.")
+@command(
+    "profiler compensate",
+    keys=("robot-form", "set", "trial", "pitch"),
+    short_help="Calibrate by the published sphere method.",
+)
 def compensate(
     call: Call,
     file: FileArgument,
     unit: UnitOption = None,
-    dataset: SetOption = "",
-    trial: TrialOption = None,
     poses: PosesOption = None,
-    robot_form: FormOption = "",
-    pitch: PitchOption = None,
     radius: RadiusOption = None,
     touches: TouchesOption = None,
     tip: TipOption = "",
-    solve_tip: Annotated[
-        bool, switch("--solve-tip", "Also estimate the tip from the touches (not in the paper).")
-    ] = False,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same
     file."""
     check_limit(limit_mm)
-    stated = PosesStated(poses, robot_form, pitch)
-    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, stated=stated)
-    record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
+    data, measured = read_sphere(call, file, unit, poses, radius, touches, tip)
+    record, found = calibrate_compensate(data, measured)
     if found["wrong_sides"]:
         console.emit_warning(
             f"The side of the sphere's centre is likely wrong in scans {found['wrong_sides']}. Check their sign."
@@ -374,9 +359,7 @@ def compensate(
     return outcome_of(call, summary, made)
 
 
-def calibrate_compensate(
-    file: Measurements, data: SphereData, *, solve_tip: bool = False
-) -> tuple[ProfilerRecord, dict[str, Any]]:
+def calibrate_compensate(file: Measurements, data: SphereData) -> tuple[ProfilerRecord, dict[str, Any]]:
     """The sphere paper's method: centres on the sides given in the file, two linear steps, compensation by touches."""
     sign = file.needed(
         "sign", "on which side (+1 or -1, along y) of the scan plane each scan has the centre; 'sphere' needs none"
@@ -397,9 +380,7 @@ def calibrate_compensate(
     )
     R, t = data.poses.rotation, data.poses.translation
     linear = published.sphere_linear(R, t, centers, translated)
-    felt = published.fit_touch_sphere(
-        data.touches.rotation, data.touches.translation, data.tip, data.radius_m, solve_tip=solve_tip
-    )
+    felt = published.fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
     best = published.compensate(linear, R, t, centers, felt.center)
 
     def off(rotation: Floats, translation: Floats) -> float:

@@ -49,9 +49,6 @@ def calibrate(
             show_default="detected",
         ),
     ] = None,
-    printed_sign: Annotated[
-        bool, switch("--printed-sign", "npz: use the sign of the touching error as printed in the paper.")
-    ] = False,
     two_stages: Annotated[bool, switch("--two-stages", "npz: also run the paper's two stages.")] = False,
     limit_mm: LimitOption = None,
 ) -> Outcome:
@@ -66,7 +63,6 @@ def calibrate(
         pen_length_m=None if pen_length_mm is None else 1e-3 * pen_length_mm,
         pen_radius_m=1e-3 * pen_radius_mm,
         hand_step_m=None if hand_step_mm is None else 1e-3 * hand_step_mm,
-        printed_sign=printed_sign,
         two_stages=two_stages,
         limit_mm=limit_mm,
     )
@@ -87,7 +83,6 @@ class VisitFiles:
     pen_length_m: float | None = None
     pen_radius_m: float = 0.0
     hand_step_m: float | None = None  # None: detected
-    printed_sign: bool = False
     two_stages: bool = False
     limit_mm: float | None = None
 
@@ -170,15 +165,14 @@ def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
     read = load_planar(inputs.file)
     visits = read.visits
     step_m = hand_step_m(visits) if inputs.hand_step_m is None else inputs.hand_step_m
-    sign = Sign.PRINTED if inputs.printed_sign else Sign.CORRECTED
     if len(visits) + len(read.refused) > 1:
         if inputs.two_stages:
             raise InputError(
                 f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with"
                 " one."
             )
-        return fit_many(inputs.file, read, sign, step_m)
-    found = fit_visit(visits[0], sign, step_m)
+        return fit_many(inputs.file, read, step_m)
+    found = fit_visit(visits[0], step_m)
     best, errors = best_model([found])
     fit, touches = found.fits[best], visits[0].touches
     shown = Shown(touches.landmark_m, found.in_page(fit.residuals_m), tuple(map(str, visits[0].rows)))
@@ -188,7 +182,7 @@ def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
         covariance=fit.covariance.tolist(),
         residual_mm=_lengths_mm(fit.residuals_m),
         leave_one_out_mm=_finite(found.left_out_mm(best).tolist()),
-        two_stages=_two_stages(touches, sign) if inputs.two_stages else None,
+        two_stages=_two_stages(touches) if inputs.two_stages else None,
         other_models={name: e for name, e in errors.items() if name != best and np.isfinite(e)},
         warnings=found.warnings,
         data_sha256={inputs.file.name: file_hash(inputs.file)},
@@ -196,10 +190,10 @@ def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
     return TabletCalibration(result=result, shown=shown, step_m=step_m, held_out_mm=found.held_out_mm(best))
 
 
-def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
+def _two_stages(touches: TabletTouches) -> dict[str, object]:
     """Return the paper's scheme in its search ranges (Table 5), for a setup like the paper's."""
-    first = tablet_stage1(touches, sign=sign)
-    second = tablet_stage2(touches, first.parameters, sign=sign)
+    first = tablet_stage1(touches, sign=Sign.CORRECTED)
+    second = tablet_stage2(touches, first.parameters, sign=Sign.CORRECTED)
     return {
         "F1": first.fitness.F,
         "F2": second.fitness.F,
@@ -213,8 +207,8 @@ def _wrist(inputs: VisitFiles) -> TabletCalibration:
         raise InputError(
             "Touches in a CSV need the robot's poses (--poses FILE) and the camera's intrinsics (--camera FILE)."
         )
-    if inputs.two_stages or inputs.printed_sign or inputs.hand_step_m:
-        raise InputError("--two-stages, --printed-sign and --hand-step-mm belong to planar touches in an npz file.")
+    if inputs.two_stages or inputs.hand_step_m:
+        raise InputError("--two-stages and --hand-step-mm belong to planar touches in an npz file.")
     if inputs.look not in ("rings", "dots"):
         raise InputError(f"--look must be rings or dots, not '{inputs.look}'.")
     look: Look = "dots" if inputs.look == "dots" else "rings"

@@ -20,7 +20,6 @@ from weldcal.calibration.tablet.planar_fit import (
     fit_linear,
     fit_planar,
 )
-from weldcal.calibration.tablet.published import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.arrays import Array
@@ -73,7 +72,7 @@ class VisitFits:
         return np.asarray(1e3 * np.linalg.norm(hand - queries.hand_m, axis=1))
 
 
-def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool = True) -> VisitFits:
+def fit_visit(visit: PlanarVisit, step_m: float, *, thorough: bool = True) -> VisitFits:
     """Fit every model; `thorough` cross-validates the interval fit too, else least squares only (twenty times faster).
 
     Raises:
@@ -81,10 +80,10 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
     """
     touches = visit.touches
     fits: dict[str, PlanarFit | LinearFit] = {}
-    config = PlanarConfig(sign=sign, step_m=step_m)
+    config = PlanarConfig(step_m=step_m)
     planar = _fit_planar(touches, config, thorough)
     _same_units(planar)
-    fits[PNP], fits[LINEAR] = planar, fit_linear(touches, sign)
+    fits[PNP], fits[LINEAR] = planar, fit_linear(touches)
     scale, deviation = planar.free_scale
     warnings = []
     if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
@@ -96,7 +95,7 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
     if visit.excluded:
         rows = ", ".join(map(str, visit.excluded))
         warnings.append(f"Not used, because a number is not finite: landmark {rows}.")
-    odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
+    odd = _other_signs(touches, planar.sigma_m) + _odd_landmarks(visit, planar, config)
     _refuse_contradictions(fits, touches, odd)
     odd = odd or _mirrored(touches)
     if planar.sigma_m > _BAD_M and not odd:
@@ -166,7 +165,7 @@ def _spread_m(touches: TabletTouches) -> float:
     return float(np.sqrt(((touches.landmark_m - touches.landmark_m.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str]:
+def _other_signs(touches: TabletTouches, sigma_m: float) -> list[str]:
     """Sentences on signs whose reversal fits far better."""
     flip = np.array([1.0, -1.0])
     extent = touches.landmark_px.max(axis=0) + touches.landmark_px.min(axis=0)
@@ -183,9 +182,7 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
     }
     found = []
     for what, other in turned.items():
-        if sign is Sign.PRINTED and what.startswith("delta_px"):
-            continue
-        left = fit_planar(other, PlanarConfig(sign=sign), leave_one_out=False).sigma_m
+        left = fit_planar(other, PlanarConfig(), leave_one_out=False).sigma_m
         if left < min(_BETTER * sigma_m, _CONTRADICTION * _spread_m(touches)):
             found.append(
                 f"The touches fit to {1e3 * left:.2f} mm instead of {1e3 * sigma_m:.2f} with {what}. Check the file."
@@ -334,7 +331,7 @@ def error_figures(errors_mm: Array) -> dict[str, float] | None:
     return statistics(errors_mm) if errors_mm.size else None
 
 
-def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVisits:
+def fit_many(file: Path, read: PlanarFile, step_m: float) -> ManyVisits:
     """Fit every visit by itself; a visit that cannot be fitted is refused with the reason.
 
     Raises:
@@ -343,7 +340,7 @@ def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVis
     fitted, refused, first = [], list(read.refused), None
     for visit in read.visits:
         try:
-            fitted.append(fit_visit(visit, sign, step_m, thorough=False))
+            fitted.append(fit_visit(visit, step_m, thorough=False))
         except WeldcalError as problem:
             refused.append((visit.name, str(problem)))
             first = first or problem
