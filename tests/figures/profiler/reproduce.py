@@ -266,7 +266,8 @@ def profiler(run: Run) -> None:
     run.table("", ("figure", "reached", "target", ""), rows)
     for title, header, lines in (*_edge_tables(edge), *_sphere_tables(sphere)):
         run.table(title, header, lines)
-    pictures(run, edge)
+    if edge:
+        pictures(run, edge)
     if run.data is not None and any(missed):
         raise Missed(f"{sum(missed)} targets of the fixed files are missed; see the table.")
 
