@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from tests.figures.harness import Row, Run, figure
@@ -19,12 +20,14 @@ from tests.worlds.tablet import (
 )
 from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, fit_plane_motion, hand_over
 from weldcal.calibration.tablet.published import (
+    AFFINE_NONE,
     PUBLISHED_EVALUATIONS,
     PUBLISHED_POPULATION,
     Fitness,
     Model,
     Sign,
     StageResult,
+    apply_affine,
     evolve,
     fitness,
     hand_to_touch,
@@ -35,7 +38,7 @@ from weldcal.calibration.tablet.published import (
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
-from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 
 MODELS: tuple[Model, ...] = ("htm", "dh")
@@ -292,6 +295,38 @@ def tablet(run: Run) -> None:
     minutes = PUBLISHED_EVALUATIONS * cost.one_evaluation / 60.0
     run.say(f"The four fits take {cost.four_fits:.2f} s; the paper's 1e8 evaluations {minutes:.0f} min, extrapolated.")
     run.write("residuals.svg", sign_residuals(touches))
+    of = {(r.model, r.stage): r.ours.parameters for r in stages}
+    run.write("tablet_fig6.svg", chain_picture(touches, of["htm", 1], None))
+    run.write("tablet_fig7.svg", chain_picture(touches, STAGE_1["htm"].parameters, of["htm", 2]))
+
+
+def chain_picture(touches: TabletTouches, stage1: Array, affine: Array | None) -> bytes:
+    """Draw Fig. 6, or Fig. 7 with an affine pair (10,): the landmarks in the base, and the hand that touches them."""
+    placed = place_landmarks(touches, stage1, "htm")
+    target = 1e3 * touches.hand_m + Sign.PRINTED * placed.correction[0]
+    pair = AFFINE_NONE if affine is None else affine
+    seen = apply_affine(pair[None, :5], placed.seen)
+    hand = apply_affine(pair[None, 5:], seen - placed.pen)[0]
+    picture, (left, right) = subplots(9.6, 4.2, 1, 2)
+    _pairs(left, "(a) landmarks", (seen[0], "from the image"), (placed.shown[0], "from the tablet"))
+    _pairs(
+        right, "(b) hand", (hand, "by Eq. 8" if affine is None else "by Eq. 8 and $A_2$"), (target, "touched, Eq. 20")
+    )
+    return svg(picture)
+
+
+def _pairs(axes: Axes, title: str, ours: tuple[Array, str], other: tuple[Array, str]) -> None:
+    """Draw two sets (n, 2) mm of points in the base with the landmarks' numbers, and their mean distance as title."""
+    axes.plot(*ours[0].T, "o", color=OURS, ms=8, mfc="none", mew=1.4, label=ours[1])
+    axes.plot(*other[0].T, "x", color=TRUTH, ms=6, mew=1.4, label=other[1])
+    for k, at in enumerate(ours[0]):
+        axes.annotate(str(k), at, (7, 5), textcoords="offset points", fontsize=8, color="#555")
+    off = float(np.linalg.norm(ours[0] - other[0], axis=1).mean())
+    axes.set_title(f"{title}: {off:.2f} mm apart on average", fontsize=10)
+    plain(axes, "base x, mm", "base y, mm")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.12)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize=9)
 
 
 def sign_residuals(touches: TabletTouches) -> bytes:
