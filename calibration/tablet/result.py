@@ -29,10 +29,11 @@ PARENT, CHILD = "tool0", "camera_optical_frame"
 class TabletResult:
     """Contents of tablet.yaml.
 
-    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name,
-    m and rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out.
-    Only for wrist: ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's
-    origin), ``p_FP_m`` and its covariance (3, 3).
+    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or of full poses: wrist, pen, pen_and_picture
+    (of the last two the camera was calibrated before); ``parameters`` by name, m and rad, and their ``covariance`` in
+    that order. ``leave_one_out_mm`` is empty where nothing could be held out. Only of full poses: ``X_FC`` and its
+    covariance (6, 6) ([rotation; translation] on the flange side about the camera's origin), ``p_FP_m`` and its
+    covariance (3, 3).
     """
 
     model: str

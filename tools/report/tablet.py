@@ -33,6 +33,8 @@ Card = tuple[str, str, str, str, str]
 _MARK = (40, 60, 220)  # BGR
 _MODELS = {
     "wrist": "full robot poses: touches determine tablet and pen, the image determines the camera",
+    "pen": "the touches alone determine the pen; the camera is as it was calibrated before",
+    "pen_and_picture": "touches and picture determine the pen; the camera is as it was calibrated before",
     "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
     "pnp_free_scale": "the tablet's size (PnP) with a free scale, then a rigid motion and the pen",
     "closed_form": "one linear least squares of six unknowns",
@@ -63,6 +65,8 @@ def tablet_screen(result: TabletResult, queries_mm: Array, limit_mm: float | Non
     if result.X_FC is not None and result.p_FP_m is not None:
         pen = ", ".join(f"{1e3 * v:.3f}" for v in result.p_FP_m)
         more = {"pen": f"its tip is at ({pen}) mm in the flange"}
+        if result.model == "pen":
+            more["camera"] = "as it was calibrated before; a picture of the page (--image, --camera) checks it"
         return FirstScreen(found, expected, _next(tolerance), (ShownPose("X_FC", WORDS, result.X_FC),), more)
     return FirstScreen(found, expected, _next(tolerance), poses, more)
 

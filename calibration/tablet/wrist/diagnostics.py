@@ -33,6 +33,8 @@ def check_wrist(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> No
     touch = float(np.sqrt((fit.touch_residuals_m**2).sum(axis=1).mean()))
     if touch > _REFUSED_M:
         raise TabletDataError(f"{_why_touches(data, touch, names)} Nothing is written.")
+    if not data.views:
+        return
     X_BF, _ = data.views[0]
     X_TB = fit.X_BT.inverse()
     p_TC = (X_TB @ X_BF @ fit.X_FC).translation()
@@ -66,7 +68,7 @@ def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...])
     touch = float(np.sqrt((fit.touch_residuals_m**2).sum(axis=1).mean()))
     if touch > _BAD_TOUCH_M and not found:
         found.append(_why_touches(data, touch, names))
-    pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
+    pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean())) if data.views else 0.0
     if pixel > _BAD_PIXEL:
         found.append(_why_pixels(pixel))
     return tuple(found)

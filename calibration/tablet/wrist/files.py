@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +210,7 @@ def file_hash(path: Path) -> str:
 def load_visit(
     touches: Path,
     poses: Path,
-    camera: Path,
+    camera: Path | None,
     *,
     image: Path | None = None,
     seen: Path | None = None,
@@ -220,14 +220,19 @@ def load_visit(
     """Touches of the page's CSV, with the flange's poses and what the camera saw (an image, or positions in a CSV).
 
     ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for
-    where the image was taken. Of a landmark touched twice the last touch and the last pose count. Landmarks without a
-    pose are left out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the
-    file and what to change (touches that are not at their landmarks too), LandmarksNotFound for the image.
+    where the image was taken. Without ``camera`` there is no image. Of a landmark touched twice the last touch and the
+    last pose count. Landmarks without a pose are left out and named in the warnings. ``tip_radius_m`` of a round pen
+    tip. Raises TabletDataError with the file and what to change (touches that are not at their landmarks too),
+    LandmarksNotFound for the image.
     """
     rows = {landmark(r, touches): r for r in read_table(touches, TOUCH_COLUMNS)}
     if not rows:
         raise TabletDataError(f"'{touches.name}' holds no touch.")
     X_camera, pose_of = _poses(poses)
+    if X_camera is None and camera is not None:
+        raise TabletDataError(
+            f"'{poses.name}' lacks the row '{CAMERA_ROW}': the flange's pose when the image was taken."
+        )
     used = [k for k in sorted(rows) if k in pose_of]
     if not used:
         raise TabletDataError(f"No landmark of '{touches.name}' has a pose in '{poses.name}'; both count from 0.")
@@ -245,31 +250,37 @@ def load_visit(
     landmarks = scale * np.array([shown[k] for k in used])
     names = tuple(str(k) for k in used)
     odd = check_page_match(touched / scale, landmarks / scale, names, 1e3 * scale, touches.name)
-    intrinsics = load_intrinsics(camera)
+    corner = landmarks.min(axis=0)
+    data = WristTouches(
+        X_BF=tuple(pose_of[k] for k in used),
+        touched_m=touched - corner,
+        landmark_m=landmarks - corner,
+        views=(),
+        focal_px=1.0,
+        tip_radius_m=tip_radius_m,
+    )
     picture, found = None, np.zeros((0, 2))
+    told = (*odd, *_warnings(rows, used, poses))
+    if camera is None or X_camera is None:
+        return WristVisit(data, told, names, picture, found)
+    intrinsics = load_intrinsics(camera)
     if seen is not None:
         uv = _seen(seen, used)
     elif image is not None:
         picture = _picture(image)
         found = find_page(picture, shown, look)
         uv = found[used]
+        told = (*told, *_image_warnings(intrinsics, picture, camera))
     else:
         raise TabletDataError("Give the camera's image (--image), or the pixels of the landmarks in it (--seen).")
-    corner = landmarks.min(axis=0)
-    data = WristTouches(
-        X_BF=tuple(pose_of[k] for k in used),
-        touched_m=touched - corner,
-        landmark_m=landmarks - corner,
-        views=((X_camera, intrinsics.rays(uv)),),
-        focal_px=float(intrinsics.focal_px.mean()),
-        tip_radius_m=tip_radius_m,
+    views = ((X_camera, intrinsics.rays(uv)),)
+    return WristVisit(
+        replace(data, views=views, focal_px=float(intrinsics.focal_px.mean())), told, names, picture, found
     )
-    told = (*odd, *_warnings(rows, used, poses, intrinsics, picture, camera))
-    return WristVisit(data, told, names, picture, found)
 
 
-def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:
-    """Return the flange where the image was taken, and at each landmark."""
+def _poses(path: Path) -> tuple[RigidTransform | None, dict[int, RigidTransform]]:
+    """Return the flange where the image was taken (None: no such row), and at each landmark."""
     found: dict[int, RigidTransform] = {}
     X_camera: RigidTransform | None = None
     for row in read_table(path, POSE_COLUMNS):
@@ -277,10 +288,6 @@ def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:
             X_camera = _flange_pose(row, path)
         else:
             found[landmark(row, path)] = _flange_pose(row, path)
-    if X_camera is None:
-        raise TabletDataError(
-            f"'{path.name}' lacks the row '{CAMERA_ROW}': the flange's pose when the image was taken."
-        )
     return X_camera, found
 
 
@@ -300,30 +307,28 @@ def _picture(path: Path) -> NDArray[np.uint8]:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def _warnings(
-    rows: Mapping[int, Row],
-    used: list[int],
-    poses: Path,
-    intrinsics: WristIntrinsics,
-    picture: NDArray[np.uint8] | None,
-    camera: Path,
-) -> tuple[str, ...]:
+def _warnings(rows: Mapping[int, Row], used: list[int], poses: Path) -> tuple[str, ...]:
     found = []
     if any(rows[k].get("size_checked", "1") == "0" for k in used):
         found.append("The page's size was not checked with a card: lengths may be wrong by some per cent.")
     without = [k for k in sorted(rows) if k not in used]
     if without:
         found.append(f"Excluded, without a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
-    if picture is not None:
-        size = np.array(picture.shape[::-1])
-        off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
-        if off.max() > _OFF_CENTRE:
-            found.append(
-                f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at"
-                f" {intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to"
-                " images of another size, or turned."
-            )
     return tuple(found)
+
+
+def _image_warnings(intrinsics: WristIntrinsics, picture: NDArray[np.uint8], camera: Path) -> tuple[str, ...]:
+    size = np.array(picture.shape[::-1])
+    off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
+    if off.max() <= _OFF_CENTRE:
+        return ()
+    return (
+        (
+            f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at"
+            f" {intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to images"
+            " of another size, or turned."
+        ),
+    )
 
 
 def _flange_pose(row: Row, path: Path) -> RigidTransform:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,12 @@ from scipy.optimize import least_squares
 from weldcal.calibration.errors import TabletDataError
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.tablet.plane_pose import tablet_pose
-from weldcal.calibration.tablet.touches import check_layout, check_turns
+from weldcal.calibration.tablet.touches import MIN_LANDMARKS, check_layout, check_turns
 from weldcal.models.arrays import Array
 
 _OPEN_PRIOR_M = 1.0  # of the pen's tip where nothing is known: far wider than any pen
 _KNOWN_PRIOR_M = 0.5e-3  # of a pen length that an operator measured
-_UNSURE_M = 5e-3  # a pen's tip worse than this is not known
+UNSURE_M = 5e-3  # a pen's tip worse than this is not known
 _LEAN = 3.0  # degrees of freedom that the scatter of all touches counts for
 _TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by zero
 
@@ -50,37 +51,55 @@ class WristTouches:
 class WristFit:
     """Camera ``X_FC`` and pen tip ``p_FP`` (3,) m on the flange, tablet ``X_BT`` in the base.
 
-    ``covariance`` (6, 6) of X_FC, [rotation; translation] on the flange side about the camera's origin, and
-    ``pen_covariance`` (3, 3) m^2, from the residuals. ``touch_residuals_m`` (n, 3), ``pixel_residuals`` (v, n, 2).
-    ``leave_one_out_m`` (n,): how far the pen would touch from what the first image shows, in the tablet's plane, by a
-    fit without that landmark. ``unobservable``: sentences on what the touches left open.
+    ``joint_covariance`` (15, 15) of X_BT, p_FP and X_FC, from the residuals, a pose as [rotation; translation] on its
+    left about its own origin; (9, 9) of the first two where there is no image. ``touch_residuals_m`` (n, 3),
+    ``pixel_residuals`` (v, n, 2). ``leave_one_out_m`` (n,): how far the pen would touch from what the first image
+    shows, in the tablet's plane, by a fit without that landmark; without an image, from where that fit has the
+    landmark. ``unobservable``: sentences on what the touches left open.
     """
 
     X_FC: RigidTransform
     p_FP: Array
     X_BT: RigidTransform
-    covariance: Array
-    pen_covariance: Array
+    joint_covariance: Array
     touch_residuals_m: Array
     pixel_residuals: Array
     leave_one_out_m: Array
     unobservable: tuple[str, ...]
 
+    @property
+    def covariance(self) -> Array:
+        """Of X_FC (6, 6), [rotation; translation] on the flange side about the camera's origin."""
+        return self.joint_covariance[9:, 9:]
 
-def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_one_out: bool = True) -> WristFit:
+    @property
+    def pen_covariance(self) -> Array:
+        """Of p_FP (3, 3) m^2."""
+        return self.joint_covariance[6:9, 6:9]
+
+
+def fit_wrist(
+    data: WristTouches,
+    pen_length_m: float | None = None,
+    *,
+    X_FC: RigidTransform | None = None,
+    leave_one_out: bool = True,
+) -> WristFit:
     """Fit tablet, pen and camera together; ``pen_length_m`` along the flange's z where it is known.
 
     Start: touches are linear in two columns of R_BT, p_BT and p_FP; the camera follows from PnP. Then least squares
-    over all fifteen unknowns, touches and pixels each weighted by their own scatter. Raises TooFewLandmarks,
-    CollinearLandmarks, EqualRotations, LandmarksNotFound (PnP), TabletDataError (no image).
+    over all fifteen unknowns, touches and pixels each weighted by their own scatter. With ``X_FC`` the camera has that
+    pose, and touches give tablet and pen; it is for data without an image. Raises TooFewLandmarks, CollinearLandmarks,
+    EqualRotations, LandmarksNotFound (PnP), TabletDataError (no image).
     """
-    if not data.views:
+    if not data.views and X_FC is None:
         raise TabletDataError("There is no image of the tablet; take at least one before touching.")
     check_layout(data.landmark_m)
     check_turns(_turns(data.X_BF))
     X_BT, p_FP = _start(data, pen_length_m)
-    X_BF0, rays = data.views[0]
-    X_FC = X_BF0.inverse() @ X_BT @ tablet_pose(rays, data.landmark_m).inverse()
+    if X_FC is None:
+        X_BF0, rays = data.views[0]
+        X_FC = X_BF0.inverse() @ X_BT @ tablet_pose(rays, data.landmark_m).inverse()
     sigma_t, sigma_p = np.full(3, 0.3e-3), 0.3
     result, covariance = (X_BT, p_FP, X_FC), np.eye(15)
     for _ in range(3):
@@ -88,23 +107,27 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
         sigma_t = _touch_sigmas(touch @ result[0].rotation().matrix())
         sigma_p = max(float(np.sqrt((pixel**2).sum() / max(pixel.size - 6, 1))), _PIXEL_FLOOR)
     X_BT, p_FP, X_FC = result
-    pen_covariance = covariance[6:9, 6:9]
-    left_out = np.full(len(data.X_BF), np.nan)
-    if leave_one_out and len(data.X_BF) > 4:
-        for i in range(len(left_out)):
-            keep = np.arange(len(left_out)) != i
-            left_out[i] = _missed(fit_wrist(data.pick(keep), pen_length_m, leave_one_out=False), data, i)
-    return WristFit(
+    fit = WristFit(
         X_FC=X_FC,
         p_FP=p_FP,
         X_BT=X_BT,
-        covariance=covariance[9:, 9:],
-        pen_covariance=pen_covariance,
+        joint_covariance=covariance,
         touch_residuals_m=touch,
         pixel_residuals=pixel,
-        leave_one_out_m=left_out,
-        unobservable=_open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
+        leave_one_out_m=np.full(len(data.X_BF), np.nan),
+        unobservable=open_directions(data, covariance[6:9, 6:9]),
     )
+    if not leave_one_out:
+        return fit
+    return replace(fit, leave_one_out_m=left_out(data, lambda d: fit_wrist(d, pen_length_m, leave_one_out=False)))
+
+
+def left_out(data: WristTouches, fit: Callable[[WristTouches], WristFit]) -> Array:
+    """Error (n,) m at each landmark by a fit to the others; NaN where they are too few."""
+    n = len(data.X_BF)
+    if n <= MIN_LANDMARKS:
+        return np.full(n, np.nan)
+    return np.array([_missed(fit(data.pick(np.arange(n) != i)), data, i) for i in range(n)])
 
 
 def _touch_sigmas(touch_T: Array) -> Array:
@@ -138,10 +161,12 @@ def measured_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
 
 def _missed(fit: WristFit, data: WristTouches, i: int) -> float:
     """Distance m in the tablet's plane between where the pen stood and what the first image says of landmark i."""
-    X_BF0, rays = data.views[0]
     R = fit.X_BT.rotation().matrix()
-    beside = R[:, :2] @ (data.touched_m[i] - data.landmark_m[i])
-    off = data.X_BF[i].multiply(fit.p_FP) - (measured_point(fit, X_BF0, rays[i]) + beside)
+    at = fit.X_BT.multiply(np.r_[data.landmark_m[i], 0.0])
+    if data.views:
+        X_BF0, rays = data.views[0]
+        at = measured_point(fit, X_BF0, rays[i])
+    off = data.X_BF[i].multiply(fit.p_FP) - (at + R[:, :2] @ (data.touched_m[i] - data.landmark_m[i]))
     return float(np.linalg.norm(R[:, :2].T @ off))
 
 
@@ -192,48 +217,47 @@ def _refine(
 ) -> tuple[tuple[RigidTransform, Array, RigidTransform], Array, Array, Array]:
     """Least squares over (X_BT, p_FP, X_FC); returns them, their covariance (15, 15) and both kinds of residuals."""
     R_BT = start[0].rotation().matrix()
-    R_BF = np.array([X.rotation().matrix() for X in data.X_BF])
-    p_BF = np.array([X.translation() for X in data.X_BF])
-    touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
-    landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
     spread = np.array([_OPEN_PRIOR_M] * 2 + [_OPEN_PRIOR_M if pen_length_m is None else _KNOWN_PRIOR_M])
     expected = np.array([0.0, 0.0, 0.0 if pen_length_m is None else pen_length_m])
 
     def moved(x: Array) -> tuple[RigidTransform, Array, RigidTransform]:
-        return _move(start[0], x[:6]), start[1] + x[6:9], _move(start[2], x[9:])
-
-    def parts(x: Array) -> tuple[Array, Array]:
-        X_BT, p_FP, X_FC = moved(x)
-        tip = R_BF @ p_FP + p_BF
-        touch = tip - X_BT.multiply(touched.T).T
-        pixel = []
-        for X_BF, rays in data.views:
-            p_C = (X_FC.inverse() @ X_BF.inverse() @ X_BT).multiply(landmarks.T)
-            pixel.append(data.focal_px * ((p_C[:2] / p_C[2]).T - rays))
-        return touch, np.array(pixel)
+        return move(start[0], x[:6]), start[1] + x[6:9], move(start[2], x[9:]) if data.views else start[2]
 
     def residuals(x: Array) -> Array:
-        touch, pixel = parts(x)
+        touch, pixel = differences(data, *moved(x))
         pen = (start[1] + x[6:9] - expected) / spread
         return np.concatenate([(touch @ R_BT / sigma_t).ravel(), pixel.ravel() / sigma_p, pen])
 
-    unit = np.r_[np.full(3, 1e-2), np.full(6, 1e-3), np.full(3, 1e-2), np.full(3, 1e-3)]
-    found = least_squares(residuals, np.zeros(15), x_scale=unit, method="lm", xtol=1e-12, ftol=1e-12)
-    touch, pixel = parts(np.asarray(found.x))
-    J = np.asarray(found.jac, dtype=float)
+    unit = np.r_[np.full(3, 1e-2), np.full(6, 1e-3), np.full(3, 1e-2), np.full(3, 1e-3)][: 15 if data.views else 9]
+    found = least_squares(residuals, np.zeros(len(unit)), x_scale=unit, method="lm", xtol=1e-12, ftol=1e-12)
+    result, J = moved(np.asarray(found.x)), np.asarray(found.jac, dtype=float)
     covariance = np.linalg.inv(J.T @ J)
-    return moved(np.asarray(found.x)), covariance, touch, pixel
+    return result, covariance, *differences(data, *result)
 
 
-def _move(X: RigidTransform, x: Array) -> RigidTransform:
+def differences(data: WristTouches, X_BT: RigidTransform, p_FP: Array, X_FC: RigidTransform) -> tuple[Array, Array]:
+    """Residuals of the touches (n, 3) m in the base, and of the images (v, n, 2) px."""
+    touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
+    landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
+    tip = np.array([X.multiply(p_FP) for X in data.X_BF])
+    pixel = []
+    for X_BF, rays in data.views:
+        p_C = (X_FC.inverse() @ X_BF.inverse() @ X_BT).multiply(landmarks.T)
+        pixel.append(data.focal_px * ((p_C[:2] / p_C[2]).T - rays))
+    return tip - X_BT.multiply(touched.T).T, np.array(pixel)
+
+
+def move(X: RigidTransform, x: Array) -> RigidTransform:
     """(exp(x_0..2) R, p + x_3..5)."""
     return RigidTransform(RotationMatrix(exp_rotation(x[:3])) @ X.rotation(), X.translation() + x[3:])
 
 
-def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple[str, ...]:
+def open_directions(data: WristTouches, pen_covariance: Array) -> tuple[str, ...]:
+    """Say what of the pen its covariance (3, 3) m^2 leaves open, and what to do."""
     values, vectors = np.linalg.eigh(pen_covariance)
-    if np.sqrt(values[-1]) < _UNSURE_M:
+    if np.sqrt(values[-1]) < UNSURE_M:
         return ()
+    spread = _axis_spread(data.X_BF)
     axis = "xyz"[int(np.abs(vectors[:, -1]).argmax())]
     return (
         (

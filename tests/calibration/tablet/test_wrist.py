@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, measured_point
+from weldcal.models.arrays import Array
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
 P_FP = np.array([-0.002, -0.021, 0.163])
@@ -19,7 +20,14 @@ FOCAL = 617.7
 
 
 def visit(
-    *, tilt: float, touch_m: float = 0.0, pixel: float = 0.0, seed: int = 0, views: int = 1, across: float = 1.0
+    *,
+    tilt: float,
+    touch_m: float = 0.0,
+    pixel: float = 0.0,
+    seed: int = 0,
+    views: int = 1,
+    across: float = 1.0,
+    p_FP: Array = P_FP,
 ) -> WristTouches:
     """Nine touches beside the landmarks, the hand turned by 22.5 deg each time and tilted by up to ``tilt`` deg;
     ``across`` the tablet the noise is so many times that along it."""
@@ -30,7 +38,7 @@ def visit(
         lean = np.radians(tilt) * rng.uniform(-1.0, 1.0, 2)
         R = RollPitchYaw(np.pi + lean[0], lean[1], np.radians(-90.0 + 22.5 * k)).ToRotationMatrix()
         tip = X_BT.multiply(np.r_[p, 0.0]) + X_BT.rotation().multiply(rng.normal(0.0, touch_m, 3) * [1, 1, across])
-        poses.append(RigidTransform(R, tip - R.multiply(P_FP)))
+        poses.append(RigidTransform(R, tip - R.multiply(p_FP)))
     taken = []
     for k in range(views):
         X_BF = RigidTransform(RollPitchYaw(np.pi + 0.15 * k, 0.1 * k, -1.0 + 0.5 * k), [0.5 + 0.02 * k, -0.1, 0.40])

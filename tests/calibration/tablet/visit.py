@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from tests.calibration.tablet.image import grid, picture, project
+from weldcal.models.arrays import Array
 from weldcal.tools.cli.app import app
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
@@ -37,7 +38,7 @@ def write(path: Path, rows: Sequence[Mapping[str, object]]) -> Path:
     return path
 
 
-def write_visit(folder: Path) -> Path:
+def write_visit(folder: Path, p_FP: Array = P_FP, X_FC: RigidTransform = X_FC) -> Path:
     """A simulated visit as files: the page's CSV, flange poses, intrinsics and a picture that is blurred and noisy."""
     rng = np.random.default_rng(5)
     shown = PAGE / (1e-3 * MM_PER_PX) + [150.5, 120.5]
@@ -48,7 +49,7 @@ def write_visit(folder: Path) -> Path:
             np.pi + 0.2 * rng.uniform(-1, 1), 0.2 * rng.uniform(-1, 1), np.radians(-90 + 22.5 * k)
         ).ToRotationMatrix()
         tip = X_BT.multiply(np.r_[1e-3 * MM_PER_PX * (p - shown[0]), 0.0]) + rng.normal(0.0, 0.05e-3, 3)
-        poses.append(_pose_row(str(k), RigidTransform(R, tip - R.multiply(P_FP))))
+        poses.append(_pose_row(str(k), RigidTransform(R, tip - R.multiply(p_FP))))
         rows.append(
             {"landmark": k, "time_utc": "2026-01-01T00:00:00.000Z", "landmark_x_px": shown[k, 0], "landmark_y_px": shown[k, 1],
              "touch_x_px": p[0], "touch_y_px": p[1], "mm_per_px": MM_PER_PX, "size_checked": 1}

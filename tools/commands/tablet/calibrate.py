@@ -11,11 +11,12 @@ import typer
 from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.planar_files import hand_step_m, load_planar
 from weldcal.calibration.tablet.published import AFFINE_NAMES, HTM_NAMES, Sign, tablet_stage1, tablet_stage2
-from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
+from weldcal.calibration.tablet.result import TabletResult, load_tablet_result, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.calibration.tablet.wrist.diagnostics import check_wrist, wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
 from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
+from weldcal.calibration.tablet.wrist.known_camera import KnownCamera, fit_pen, moved_camera
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 from weldcal.tools.commands.tablet.planar import NAMES, ManyVisits, best_model, error_figures, fit_many, fit_visit
@@ -35,6 +36,10 @@ def calibrate(
     ] = None,
     seen: Annotated[Path | None, option("--seen", "CSV", "Instead of --image: landmark,u,v in the image.")] = None,
     look: Annotated[str, option("--look", "LOOK", "Landmarks in the image: rings or dots.")] = "rings",
+    known_camera: Annotated[
+        Path | None,
+        option("--known-camera", "RESULT", "A former calibration: the camera stays, and touches give another pen."),
+    ] = None,
     pen_length_mm: Annotated[
         float | None, option("--pen-length-mm", "MM", "Distance of the pen tip from the flange, along its z axis.")
     ] = None,
@@ -60,6 +65,7 @@ def calibrate(
         image=image,
         seen=seen,
         look=look,
+        known_camera=known_camera,
         pen_length_m=None if pen_length_mm is None else 1e-3 * pen_length_mm,
         pen_radius_m=1e-3 * pen_radius_mm,
         hand_step_m=None if hand_step_mm is None else 1e-3 * hand_step_mm,
@@ -80,6 +86,7 @@ class VisitFiles:
     image: Path | None = None
     seen: Path | None = None
     look: str = "rings"
+    known_camera: Path | None = None
     pen_length_m: float | None = None
     pen_radius_m: float = 0.0
     hand_step_m: float | None = None  # None: detected
@@ -160,8 +167,11 @@ def calibrate_tablet(inputs: VisitFiles, folder: Path) -> TabletCalibration | Ma
 
 
 def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
-    if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
-        raise InputError("An npz file is complete. Omit --poses, --camera, --image and --seen, or give the CSV.")
+    extra = (inputs.poses, inputs.camera, inputs.image, inputs.seen, inputs.known_camera)
+    if any(path is not None for path in extra):
+        raise InputError(
+            "An npz file is complete. Omit --poses, --camera, --image, --seen and --known-camera, or give the CSV."
+        )
     read = load_planar(inputs.file)
     visits = read.visits
     step_m = hand_step_m(visits) if inputs.hand_step_m is None else inputs.hand_step_m
@@ -203,10 +213,11 @@ def _two_stages(touches: TabletTouches) -> dict[str, object]:
 
 
 def _wrist(inputs: VisitFiles) -> TabletCalibration:
-    if inputs.poses is None or inputs.camera is None:
-        raise InputError(
-            "Touches in a CSV need the robot's poses (--poses FILE) and the camera's intrinsics (--camera FILE)."
-        )
+    known = None if inputs.known_camera is None else _camera_of(inputs.known_camera)
+    pictured = known is None or inputs.image is not None or inputs.seen is not None
+    if inputs.poses is None or (inputs.camera is None and pictured):
+        need = " and the camera's intrinsics (--camera FILE)" if pictured else ""
+        raise InputError(f"Touches in a CSV need the robot's poses (--poses FILE){need}.")
     if inputs.two_stages or inputs.hand_step_m:
         raise InputError("--two-stages and --hand-step-mm belong to planar touches in an npz file.")
     if inputs.look not in ("rings", "dots"):
@@ -221,14 +232,21 @@ def _wrist(inputs: VisitFiles) -> TabletCalibration:
         look=look,
         tip_radius_m=inputs.pen_radius_m,
     )
-    fit = fit_wrist(visit.data, inputs.pen_length_m)
-    check_wrist(visit.data, fit, visit.names)
+    data = visit.data
+    moved: tuple[str, ...] = ()
+    if known is not None and data.views:
+        free = fit_wrist(data, inputs.pen_length_m, leave_one_out=False)
+        check_wrist(data, free, visit.names)
+        moved = moved_camera(free, known)
+        data = replace(data, views=()) if moved else data
+    fit = fit_wrist(data, inputs.pen_length_m) if known is None else fit_pen(data, known, inputs.pen_length_m)
+    check_wrist(data, fit, visit.names)
     files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
     in_page = fit.touch_residuals_m @ fit.X_BT.rotation().matrix()[:, :2]
     picture = None if visit.picture is None else marked_picture(visit.picture, visit.found_px)
     shown = Shown(visit.data.landmark_m, in_page, visit.names, picture)
     result = TabletResult(
-        model="wrist",
+        model="wrist" if known is None else "pen_and_picture" if data.views else "pen",
         parameters=_wrist_parameters(fit),
         covariance=fit.covariance.tolist(),
         residual_mm=_lengths_mm(fit.touch_residuals_m),
@@ -238,10 +256,20 @@ def _wrist(inputs: VisitFiles) -> TabletCalibration:
         p_FP_m=fit.p_FP.tolist(),
         p_FP_covariance=fit.pen_covariance.tolist(),
         unobservable=fit.unobservable,
-        warnings=(*visit.warnings, *wrist_diagnostics(visit.data, fit, visit.names)),
+        warnings=(*visit.warnings, *moved, *wrist_diagnostics(data, fit, visit.names)),
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
     return TabletCalibration(result=result, shown=shown, wrist=fit)
+
+
+def _camera_of(path: Path) -> KnownCamera:
+    """Read a calibration by touches with full poses: its camera."""
+    result = load_tablet_result(path)
+    if result.X_FC is None or result.X_FC_covariance is None:
+        raise InputError(
+            f"'{path}' does not hold the camera's pose: it is of an npz. Give --known-camera a calibration of a CSV."
+        )
+    return KnownCamera(result.X_FC, np.array(result.X_FC_covariance), str(path))
 
 
 def _wrist_parameters(fit: WristFit) -> dict[str, float]:
