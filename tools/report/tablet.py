@@ -66,7 +66,7 @@ def tablet_screen(result: TabletResult, queries_mm: Array, limit_mm: float | Non
         pen = ", ".join(f"{1e3 * v:.3f}" for v in result.p_FP_m)
         more = {"pen": f"its tip is at ({pen}) mm in the flange"}
         if result.model == "pen":
-            more["camera"] = "as it was calibrated before; a picture of the page (--image, --camera) checks it"
+            more["camera"] = "as it was calibrated before; only a picture of the page (--image, --camera) can check it"
         return FirstScreen(found, expected, _next(tolerance), (ShownPose("X_FC", WORDS, result.X_FC),), more)
     return FirstScreen(found, expected, _next(tolerance), poses, more)
 

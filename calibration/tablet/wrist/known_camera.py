@@ -48,9 +48,8 @@ def moved_camera(free: WristFit, known: KnownCamera) -> tuple[str, ...]:
     return (
         (
             f"Picture and touches put the camera {1e3 * np.linalg.norm(off[3:]):.1f} mm and"
-            f" {np.degrees(np.linalg.norm(off[:3])):.2f} deg from where '{known.name}' has it, so the pen is by the"
-            " touches alone. If the page lay still, the camera moved: calibrate both by the same command without"
-            " --known-camera."
+            f" {np.degrees(np.linalg.norm(off[:3])):.2f} deg from where '{known.name}' has it: if the page lay still,"
+            " calibrate both by the same command without --known-camera. The pen is by the touches alone."
         ),
     )
 
