@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from scipy.optimize import Bounds, differential_evolution, least_squares, minimize
+from scipy.optimize import least_squares, minimize
 
 from weldcal.calibration.tablet.touches import TabletTouches, check_touches
 from weldcal.models.arrays import Array
@@ -257,10 +257,6 @@ def minimise_distances(residuals: Residuals, start: Array, search_range: Array) 
     return DistanceMinimum(x, value(x), count)
 
 
-Minimiser = Callable[[Residuals, Array], DistanceMinimum]
-"""Finds a minimum of residuals within a range (p, 2)."""
-
-
 @dataclass(frozen=True)
 class StageResult:
     """One stage: its parameters (mm and degrees, named above), its fitness, its cost."""
@@ -270,18 +266,8 @@ class StageResult:
     evaluations: int
 
 
-def from_the_middle(residuals: Residuals, search: Array) -> DistanceMinimum:
-    """Return the fast solver from the middle of the range, where there is no better idea."""
-    return minimise_distances(residuals, search.mean(axis=1), search)
-
-
 def tablet_stage1(
-    touches: TabletTouches,
-    model: Model = "htm",
-    sign: Sign = Sign.PRINTED,
-    *,
-    dh_offset_in_error: bool = True,
-    minimiser: Minimiser = from_the_middle,
+    touches: TabletTouches, model: Model = "htm", sign: Sign = Sign.PRINTED, *, dh_offset_in_error: bool = True
 ) -> StageResult:
     """Stage 1 (Eqs. 17-20): the twelve parameters of a chain.
 
@@ -289,7 +275,10 @@ def tablet_stage1(
     y only.
     """
     check_touches(touches)
-    found = minimiser(lambda x: stage1_residuals(touches, x, model, sign, dh_offset_in_error), search_range(model))
+    search = search_range(model)
+    found = minimise_distances(
+        lambda x: stage1_residuals(touches, x, model, sign, dh_offset_in_error), search.mean(axis=1), search
+    )
     return StageResult(found.parameters, fitness(found.residuals), found.evaluations)
 
 
@@ -300,7 +289,6 @@ def tablet_stage2(
     sign: Sign = Sign.PRINTED,
     *,
     dh_offset_in_error: bool = True,
-    minimiser: Minimiser | None = None,
 ) -> StageResult:
     """Stage 2 (Eqs. 21-24): the ten parameters of the affine pair on top of ``stage1`` (12,)."""
     placed = place_landmarks(touches, stage1, model, dh_offset_in_error)
@@ -308,11 +296,7 @@ def tablet_stage2(
     def residuals(x: Array) -> Array:
         return stage2_residuals(touches, x, placed, sign)
 
-    found = (
-        minimise_distances(residuals, AFFINE_NONE, AFFINE_RANGE)
-        if minimiser is None
-        else minimiser(residuals, AFFINE_RANGE)
-    )
+    found = minimise_distances(residuals, AFFINE_NONE, AFFINE_RANGE)
     return StageResult(found.parameters, fitness(found.residuals), found.evaluations)
 
 
@@ -346,46 +330,3 @@ def hand_to_touch(
     about = (first - own.pen)[:, centre]
     moved = apply_affine(a[:, :5], asked.seen, own.seen[:, centre]) - asked.pen
     return np.asarray(1e-3 * apply_affine(a[:, 5:], moved, about)[0])
-
-
-PUBLISHED_POPULATION = 10_000
-PUBLISHED_GENERATIONS = 10_000
-PUBLISHED_EVALUATIONS = PUBLISHED_POPULATION * PUBLISHED_GENERATIONS
-CROSSOVER = 0.9  # the paper's Table 4
-WEIGHT = 0.5  # the paper's Table 4
-
-
-def evolve(
-    residuals: Residuals, search_range: Array, seed: int, population: int = 240, generations: int = 1250
-) -> DistanceMinimum:
-    """Minimise mean |e_1..n| + mean |e_n+1..2n| by DE/rand/1/bin in a range (p, 2); deterministic for a seed.
-
-    The paper's population and generations (10,000 each) are far more than it takes: 3e5 evaluations already end at the
-    same minimum for every seed. Whole generations are computed in one call.
-    """
-    low, high = search_range[:, 0], search_range[:, 1]
-    start = np.random.default_rng(seed).uniform(low, high, (population, len(low)))
-    evaluations = 0
-
-    def objective(columns: Array, /, *_: object) -> Any:
-        nonlocal evaluations
-        r = residuals(columns.T)
-        evaluations += len(r)
-        return np.asarray(np.sqrt((r**2).sum(axis=2)).sum(axis=1) / (r.shape[1] // 2))
-
-    found = differential_evolution(
-        objective,
-        Bounds(low, high),
-        strategy="rand1bin",
-        maxiter=generations,
-        init=start,
-        mutation=WEIGHT,
-        recombination=CROSSOVER,
-        tol=0.0,
-        atol=1e-9,
-        rng=seed,
-        polish=False,
-        updating="deferred",
-        vectorized=True,
-    )
-    return DistanceMinimum(np.asarray(found.x), residuals(found.x[None])[0], evaluations)

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 from tests.figures.harness import Run
+from tests.figures.tablet.evolution import cost, evolve
 from tests.figures.tablet.reproduce import compare_models, reproduce_stages, tablet
 from tests.places import SHARED_DATA, require_data
 from tests.worlds.tablet import STAGE_1, STAGE_2, published_touches
 from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.published import (
     AFFINE_NONE,
+    AFFINE_RANGE,
     DH_NAMES,
     HTM_NAMES,
     Sign,
     StageResult,
-    evolve,
     fitness,
     hand_to_touch,
     place_landmarks,
@@ -43,7 +44,7 @@ def touches() -> TabletTouches:
 @pytest.fixture(scope="module")
 def found(touches: TabletTouches) -> dict[tuple[str, int], StageResult]:
     """The fast solver's stages of both chains."""
-    return {(r.model, r.stage): r.ours for r in reproduce_stages(touches, ())[0]}
+    return {(r.model, r.stage): r.ours for r in reproduce_stages(touches, ())}
 
 
 def test_the_typed_tables_are_those_of_the_shared_file(touches: TabletTouches) -> None:
@@ -102,11 +103,26 @@ def test_left_out_landmarks_are_predicted_three_times_better(touches: TabletTouc
 
 
 def test_differential_evolution_ends_where_the_fast_solver_does(touches: TabletTouches) -> None:
-    found = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 100, 700))
-    assert pytest.approx(tablet_stage1(touches).fitness.F, abs=1e-3) == found.fitness.F
-    again = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 20, 3))
-    same = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 20, 3))
+    for r in reproduce_stages(touches, (1, 2, 3)):
+        for evolved in r.evolved:
+            assert pytest.approx(r.ours.fitness.F, abs=1e-5) == evolved.fitness.F
+    again, same = (evolve(touches, "htm", 1, 3, 20, 3) for _ in range(2))
     assert (again.parameters == same.parameters).all()
+
+
+def test_the_compiled_cost_is_that_of_the_residuals(touches: TabletTouches) -> None:
+    rng = np.random.default_rng(0)
+    for model in ("htm", "dh"):
+        placed = place_landmarks(touches, STAGE_1[model].parameters, model)
+        for stage, search in ((1, search_range(model)), (2, AFFINE_RANGE)):
+            x = rng.uniform(search[:, 0], search[:, 1], (100, len(search)))
+            r = (
+                stage1_residuals(touches, x, model, Sign.PRINTED)
+                if stage == 1
+                else stage2_residuals(touches, x, placed, Sign.PRINTED)
+            )
+            wanted = [fitness(one).F for one in r]
+            np.testing.assert_allclose(cost(touches, model, stage, x), wanted, rtol=1e-12)
 
 
 def test_a_tilt_and_its_mirror_image_fit_alike(touches: TabletTouches) -> None:
