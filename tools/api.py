@@ -17,6 +17,7 @@ from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.solve import HandEyeResult, as_poses
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.calibration.recorded_hand_eye import solve_arrays
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
@@ -25,10 +26,10 @@ from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.wiring import Replacement
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import run_procedure
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.calibration import CalibrationReport
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import VerifyReport
@@ -74,11 +75,11 @@ def calibrate(
     Raises:
         InputError, TooFewPoses: the data cannot be used; the message says what to change.
     """
-    options: dict[str, Any] = {"robot": robot, "flange": flange, "correct_scanner": correct_scanner, "seed": seed}
+    asked = FlangeOptions(robot=robot, flange=flange, correct_scanner=correct_scanner, seed=seed)
     if out is not None:
-        return calibrate_dataset(Path(folder), Path(out), **options)
+        return calibrate_dataset(Path(folder), Path(out), asked)
     with tempfile.TemporaryDirectory() as kept_for_now:
-        return calibrate_dataset(Path(folder), Path(kept_for_now), **options)
+        return calibrate_dataset(Path(folder), Path(kept_for_now), asked)
 
 
 def verify(

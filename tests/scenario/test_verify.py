@@ -26,8 +26,8 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.verify import VerifyReport
 

@@ -8,11 +8,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import CARE, DO_NOT
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic, write_json
@@ -128,7 +129,7 @@ def find_cells(folder: Path) -> dict[str, dict[str, Path]]:
 
 def calibrate_one(dataset: str, out: str, seed: int) -> Mapping[str, object]:
     """One task: calibrate a dataset; the JSON object of `calibrate`, without the time it took."""
-    found = dict(calibrate_dataset(Path(dataset), Path(out), seed=seed).summary())
+    found = dict(calibrate_dataset(Path(dataset), Path(out), FlangeOptions(seed=seed)).summary())
     found.pop("seconds")
     return found
 

@@ -7,9 +7,8 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
@@ -79,26 +78,6 @@ def fixed(value: float | None, digits: int = 2) -> str:
 def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     """Numbers as ``fixed`` writes them, in one row."""
     return "  ".join(fixed(float(value), digits) for value in values)
-
-
-def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Compute median, mean, rms, p95, min, max by name (median, mean, p95, max without); NaN for no finite value."""
-    v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
-    of: dict[str, Callable[[Array], Any]] = {
-        "median": np.median,
-        "mean": np.mean,
-        "rms": lambda x: np.sqrt(np.mean(x**2)),
-        "p95": lambda x: np.percentile(x, 95),
-        "min": np.min,
-        "max": np.max,
-    }
-    chosen = names or ("median", "mean", "p95", "max")
-    return {name: float(of[name](v)) if len(v) else float("nan") for name in chosen}
-
-
-def known(value: float) -> float | None:
-    """Return the number for a JSON object; None where it is not finite."""
-    return float(value) if math.isfinite(value) else None
 
 
 def sigma_rows(covariance: Array) -> list[tuple[str, str]]:

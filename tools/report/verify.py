@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, known, statistics
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.validation import Offset
 from weldcal.calibration.flange.fit import FlangeFit
@@ -29,7 +29,7 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars, error_field
-from weldcal.tools.report.render import fixed, known, statistics
+from weldcal.tools.report.render import fixed
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from weldcal.calibration.data.results import known
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
@@ -22,7 +23,7 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, known
+from weldcal.tools.report.render import fixed
 from weldcal.tools.report.verify import NONE, Verdict
 
 CANNOT_TELL = "cannot tell"

@@ -14,8 +14,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
 from tests.worlds.light_runs import mounted_world
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, statistics
 from weldcal.calibration.data.scanner_correction import ScannerClock
+from weldcal.calibration.eye_on_base.observations import FlangeObservations
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import Convergence
 from weldcal.calibration.hand_eye.mountings import get_mounting
@@ -38,7 +39,6 @@ from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.mounting import MountingReport, mounting_report
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
-from weldcal.tools.report.render import statistics
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
@@ -79,7 +79,7 @@ def calibration(**changes: Any) -> CalibrationReport:
         estimate=ESTIMATE,
         observations=tuple(OBSERVATIONS),
         scanner=None,
-        fits={},
+        seen=FlangeObservations(tuple(OBSERVATIONS), {}, {}, {}, ()),
         refused=(("p99", "No flange was found."),),
         outliers=(),
         algorithm1=None,
