@@ -25,8 +25,8 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.recorded import calibrate_dataset
+from weldcal.tools.verified import verify_dataset
 
 
 @pytest.fixture(scope="module")

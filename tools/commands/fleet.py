@@ -9,14 +9,15 @@ import numpy as np
 import typer
 
 from weldcal.calibration.recorded_flange import FlangeOptions
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
-from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import CARE, DO_NOT
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic, write_json
+from weldcal.tools.verified import verify_dataset
 
 HEADER = "dataset.yaml"
 FAILED = "failed"
@@ -136,7 +137,7 @@ def calibrate_one(dataset: str, out: str, seed: int) -> Mapping[str, object]:
 
 def verify_one(result: str, dataset: str, out: str, limit_mm: float | None, seed: int) -> Mapping[str, object]:
     """One task: verify a calibration on a dataset; the JSON object of `verify`."""
-    return verify_dataset(Path(result), Path(dataset), Path(out), limit_mm=limit_mm, seed=seed).summary()
+    return verify_dataset(Path(result), Path(dataset), Path(out), VerifyOptions(limit_mm=limit_mm, seed=seed)).summary()
 
 
 def _step(farm: Farm, what: str) -> Farm:

@@ -28,11 +28,12 @@ from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
+from weldcal.calibration.verified_scans import PoseError
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
-from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
+from weldcal.tools.report.first_screen import NO_TOLERANCE, FirstScreen
 from weldcal.tools.report.hand_eye import HandEyeReport, hand_eye_report
 from weldcal.tools.report.monitor import MonitorReport, monitor_page
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
@@ -42,7 +43,7 @@ from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, Profile
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
-from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
+from weldcal.tools.report.verify import VerifyReport, verify_report
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")
@@ -102,7 +103,6 @@ def calibrate() -> Made:
 def verify() -> Made:
     """`verify` on scans of which some were used before."""
     poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
-    verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
     report = VerifyReport(
         result=RESULT,
         correction=None,
@@ -113,8 +113,9 @@ def verify() -> Made:
         warnings=("Take new scans.",),
         hashes={},
         out=OUT,
-        verdict=verdict,
+        limit_mm=0.4,
         source="given",
+        doubts=("Something.",),
     )
     return report.first, verify_report(report, dataset="others")
 
