@@ -16,7 +16,6 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import (
     CalibrationResult,
     export_all,
-    pose_records,
     save_result,
     software_version,
     statistics,
@@ -29,7 +28,7 @@ from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges, require_flange
 from weldcal.calibration.eye_on_base.solve import SolveConfig
-from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
+from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.calibration.eye_on_base.validation import Convergence, convergence, k_fold, sampling_advice
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -136,11 +135,6 @@ class _Scans:
     def corrects(self) -> bool:
         """Whether a scanner correction may be applied."""
         return self.asked.correct_scanner and self.confirmed
-
-    @property
-    def oriented(self) -> bool:
-        """Whether every pose has an orientation."""
-        return all(p.has_orientation for p in self.data.pairs)
 
     @property
     def X_FR(self) -> RigidTransform | None:
@@ -384,37 +378,30 @@ def _result(
 ) -> CalibrationResult:
     """Return the contents of calibration.yaml."""
     estimate, refined, data = found.estimate, found.refined, scans.data
-    values = {
-        "residual_mm": 1e3 * estimate.position_residuals_m,
-        "held_out_mm": 1e3 * estimate.held_out.position_m,
-        "tilt_deg": np.degrees(estimate.tilt_residuals_rad),
-        "held_out_tilt_deg": np.degrees(estimate.held_out.tilt_rad),
-    }
     turned = scans.asked.axis_turn_deg is None
-    return CalibrationResult(
-        X_BC=estimate.X_BC,
-        covariance=estimate.covariance,
-        held_out_mm=statistics(values["held_out_mm"][estimate.inliers]),
+    return estimate_result(
+        estimate,
+        scans.seen.observations,
+        refused,
+        scans.X_FR,
+        _angles(data, inliers),
+        held_out_mm=statistics(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=tilt_summary(estimate.held_out.tilt_rad[estimate.inliers]),
-        poses=pose_records([o.id for o in scans.seen.observations], estimate.inliers, values, refused),
-        unobservable=estimate.unobservable,
         warnings=warnings,
         robot=scans.robot,
         flange=scans.standard.designation,
         scanner=data.header.scanner,
-        sigma_position_mm=1e3 * estimate.sigma_position_m,
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)) if scans.seen.fits else 0.0,
         seed=scans.asked.seed,
         data_hashes=data.hashes,
         scanner_correction=None if found.correction is None else found.correction.document(),
-        joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, scans.seen.patterns, found.X_rigid) if turned else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
-        orientations=orientations_of(inliers, scans.X_FR) if scans.oriented else None,
-        observed=observed_document(inliers, scans.X_FR, _angles(data, inliers)) if scans.oriented else None,
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
+        # positions alone say nothing of the flange's orientation
+        **({} if all(p.has_orientation for p in data.pairs) else {"orientations": None, "observed": None}),
     )
 
 

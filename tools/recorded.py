@@ -8,11 +8,11 @@ from pathlib import Path
 from weldcal.calibration.doctor.case import DoctorCase, write_case
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.recorded_flange import FlangeOptions, calibrate_flange, save_flange
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import WeldcalError
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import Algorithm1Outcome, CalibrationReport, calibration_report
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import csv_text, write_atomic
+from weldcal.tools.report.render import check_folder, csv_text, write_atomic
 
 
 def calibrate_dataset(
@@ -41,8 +41,7 @@ def calibrate_dataset(
     started = time.monotonic()
     check_limit(limit_mm)
     tell: Progress = progress or (lambda stage, fraction: None)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    check_folder(out)
     found = calibrate_flange(folder, asked, tell, partial(_examine, out))
     algorithm1: Algorithm1Outcome | None = None
     if compare:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from weldcal.calibration.verified_pairs import PairsOptions, verify_pairs
 from weldcal.calibration.verified_scans import VerifyOptions, verify_scans
-from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import check_folder, write_atomic
 from weldcal.tools.report.verify import VerifyReport, verify_report
 from weldcal.tools.report.verify_pairs import PairsReport, verify_pairs_report
 
@@ -27,8 +26,7 @@ def verify_dataset(
     asked = asked or VerifyOptions()
     tell: Progress = progress or (lambda stage, fraction: None)
     check_limit(asked.limit_mm)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"'{out}' is a file. Give a folder for the verification.")
+    check_folder(out, "verification")
     found = verify_scans(result, dataset, asked, tell)
     named = {"dataset": str(dataset), "calibration": str(result), "pose": asked.pose or ""}
     report = VerifyReport(**vars(found) | named, out=out)

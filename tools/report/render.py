@@ -16,12 +16,19 @@ from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic as write_atomic
 from weldcal.tools.console import plain
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
 
 _OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*)")
+
+
+def check_folder(out: Path, what: str = "result") -> None:
+    """Check that a folder can be written. Raises InputError where a file has its name."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file. Give a folder for the {what}.")
 
 
 def render(template: str, **context: object) -> str:
