@@ -29,7 +29,7 @@ from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.wiring import Replacement
-from weldcal.tools.commands.demo import run_procedure
+from weldcal.tools.procedure import run_procedure
 from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.calibration import CalibrationReport
 from weldcal.tools.report.run import RunOptions
