@@ -23,13 +23,14 @@ from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.verify import VerifyReport
+from weldcal.tools.verified import verify_dataset
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
@@ -190,7 +191,7 @@ def test_another_robot_flange_or_scanner_is_named(halves: tuple[Path, Path], tmp
     few = _few(halves, tmp_path / "few", 1)
     header = (few / "dataset.yaml").read_text()
     (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5").replace("phoxi_s", "phoxi_m"))
-    report = verify_dataset(halves[0], few, tmp_path / "out", flange="tool-ring-63")
+    report = verify_dataset(halves[0], few, tmp_path / "out", VerifyOptions(flange="tool-ring-63"))
     for what, was, now in (
         ("robot", "aubo_i5", "ur5"),
         ("flange", "iso9409-1-50-4-m6", "tool-ring-63"),
@@ -204,7 +205,7 @@ def test_another_arm_is_the_first_words_of_a_verdict(halves: tuple[Path, Path], 
     header = (few / "dataset.yaml").read_text()
     (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5"))
     named = "The calibration was made with the robot 'aubo_i5', these scans with 'ur5'."
-    report = verify_dataset(halves[0], few, tmp_path / "out", limit_mm=1e-3)
+    report = verify_dataset(halves[0], few, tmp_path / "out", VerifyOptions(limit_mm=1e-3))
     assert report.verdict.verdict == DO_NOT
     assert report.verdict.reason.startswith(named)
     assert report.warnings[0].startswith(named)
