@@ -1,6 +1,6 @@
 """Verify a calibration on recorded scans of the flange that it did not use: the error of each, and what it shows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,16 +8,23 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
-from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result, software_version
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
-from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
+from weldcal.calibration.eye_on_base.stated_error import (
+    FALSE_ALARM,
+    joint_terms,
+    place_sensitivity,
+    scatter_elsewhere,
+    stated_median_limit,
+)
 from weldcal.calibration.eye_on_base.validation import Offset, offset_from, position_errors, scale_error, tilt_errors
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import as_transform
+from weldcal.calibration.geometry.robust import f_quantile
+from weldcal.calibration.geometry.se3 import as_transform, skew
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
@@ -33,6 +40,7 @@ _TURN_DEG = 3.0  # orientations closer than this are one orientation to a verifi
 _GROSS = 10.0  # times the usual error: a gross outlier
 _SAME_MM = 1e-6  # a scan of the same name whose error repeats the recorded residual to a nanometre is the same scan
 _EVIDENT = 4.0  # standard errors of a scale error that is worth naming
+_BEYOND_CHANCE = 0.99  # one sound calibration in a hundred is off by more than this quantile of what is known
 _UNCORRECTED = (
     "The result's scanner correction is not applied, as requested. Its X_BC belongs to corrected points, so these are"
     " the errors of a program that does not correct its scans."
@@ -48,6 +56,7 @@ class VerifyOptions:
         correct_scanner: apply the result's scanner correction.
         limit_mm: of the new scans' median; None: it follows from what the calibration states.
         pose: names the pose in a file of several.
+        correct: shift the calibration by what the new scans show, where that is more than chance.
     """
 
     flange: str | None = None
@@ -55,6 +64,7 @@ class VerifyOptions:
     correct_scanner: bool = True
     limit_mm: float | None = None
     pose: str | None = None
+    correct: bool = False
     seed: int = 0
 
 
@@ -82,6 +92,7 @@ class VerifiedScans:
         flange: what an option must state for these scans.
         notes: how the files were read.
         offset: how far X_BC is off by the new scans alone; None where they are too few.
+        corrected, shift: the calibration shifted by that, and a sentence on it, where this was asked for.
     """
 
     result: CalibrationResult
@@ -99,6 +110,8 @@ class VerifiedScans:
     notes: tuple[str, ...] = ()
     offset: Offset | None = None
     flange: str = ""
+    corrected: CalibrationResult | None = None
+    shift: str = ""
 
 
 def verify_scans(
@@ -134,6 +147,11 @@ def verify_scans(
         limit_mm = _stated_limit(calibration, judged, new)
         source = f"which {100 * FALSE_ALARM:.0f} % of verifications of a calibration as good as it states exceed"
     without, evident = _uncorrected(calibration, observations)
+    fresh = [observations[k] for k in new]
+    offset = offset_from(calibration.X_BC, fresh, asked.seed)
+    shifted: tuple[CalibrationResult | None, str] = (None, "")
+    if asked.correct:
+        shifted = shifted_result(calibration, judged.correction, fresh, offset)
     return VerifiedScans(
         result=calibration,
         correction=judged.correction,
@@ -154,9 +172,72 @@ def verify_scans(
         doubts=(*differences, *_gross(calibration, poses), *judged.sentences, *_alike(data, observations)),
         other_arm=other_arm,
         notes=read_as if evident else (*read_as, *without),
-        offset=offset_from(calibration.X_BC, [observations[k] for k in new], asked.seed),
+        offset=offset,
         flange=standard.designation if asked.flange or not data.header.flange else "",
+        corrected=None if shifted[0] is None else replace(shifted[0], data_hashes=data.hashes),
+        shift=shifted[1],
     )
+
+
+def shifted_result(
+    result: CalibrationResult,
+    correction: ScannerCorrection | None,
+    observations: Sequence[Observation],
+    offset: Offset | None,
+) -> tuple[CalibrationResult | None, str]:
+    """Shift a calibration by its offset on new observations (n), and say so; None where chance explains the offset.
+
+    Eq. (21) of the flange paper for the position, from all new scans in place of one registration. In the middle of
+    these scans the shifted pose is as good as they are; its rotation stays. Its held-out errors are theirs, each with
+    the shift from the others.
+    """
+    if offset is None:
+        return None, "Not corrected: the new scans do not determine a pose. Take four or more across the work space."
+    p_CQ = np.asarray(offset.new.X_BC.inverse() @ offset.p_BQ)
+    whole, terms = joint_terms(result, correction)
+    J = place_sensitivity(result, p_CQ, terms)
+    of_both = J @ whole @ J.T + offset.covariance
+    n = int(offset.new.inliers.sum())
+    limit = 3.0 * f_quantile(_BEYOND_CHANCE, 3, max(3.0 * n - 6.0, 3.0))
+    off = 1e3 * float(np.linalg.norm(offset.shift_m))
+    if float(offset.shift_m @ np.linalg.solve(of_both, offset.shift_m)) <= limit:
+        return None, f"Not corrected: an offset of {off:.3f} mm is chance here, and a shift would make it worse."
+    X = RigidTransform(result.X_BC.rotation(), result.X_BC.translation() - offset.shift_m)
+    lever = np.eye(6)
+    lever[3:, :3] = skew(offset.p_BQ - X.translation())  # the turn is about the point that is known
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = result.covariance[:3, :3], offset.covariance
+    joint = result.joint_covariance
+    if joint is not None:
+        joint = joint.copy()
+        joint[:6, 6:] = joint[6:, :6] = 0.0
+        joint[:6, :6] = lever @ covariance @ lever.T
+    kept = [o for o, keep in zip(observations, offset.new.inliers, strict=True) if keep]
+    held = 1e3 * position_errors(X, kept) * n / max(n - 1, 1)
+    sentence = (
+        f"X_BC is shifted by {off:.3f} mm, which {n} new scans show. At their middle it is known to"
+        f" {1e3 * offset.sigma_m:.3f} mm (one sigma)."
+    )
+    turn_sigma = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3] + offset.new.covariance[:3, :3])[-1]))
+    if offset.turn_rad > _EVIDENT * turn_sigma:
+        sentence += (
+            f" It is also turned by {np.degrees(offset.turn_rad):.2f} degrees, which a shift leaves: calibrate from"
+            " these scans to use it elsewhere."
+        )
+    shifted = replace(
+        result,
+        X_BC=X,
+        covariance=lever @ covariance @ lever.T,
+        joint_covariance=joint,
+        held_out_mm={
+            "median": float(np.median(held)),
+            "mean": float(held.mean()),
+            "p95": float(np.percentile(held, 95.0)),
+        },
+        warnings=(*result.warnings, sentence),
+        software=software_version(),
+    )
+    return shifted, sentence
 
 
 def _find_flanges(

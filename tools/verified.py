@@ -4,12 +4,13 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.verified_pairs import PairsOptions, verify_pairs
 from weldcal.calibration.verified_scans import VerifyOptions, verify_scans
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import check_folder, write_atomic
-from weldcal.tools.report.verify import VerifyReport, verify_report
+from weldcal.tools.report.verify import CORRECTED, VerifyReport, verify_report
 from weldcal.tools.report.verify_pairs import PairsReport, verify_pairs_report
 
 
@@ -31,6 +32,9 @@ def verify_dataset(
     named = {"dataset": str(dataset), "calibration": str(result), "pose": asked.pose or ""}
     report = VerifyReport(**vars(found) | named, out=out)
     tell("writing the report", 0.9)
+    if found.corrected is not None:
+        export_all(found.corrected, out / CORRECTED)
+        save_result(found.corrected, out / CORRECTED)
     _write_verification(out, verify_report(report, dataset=dataset.resolve().name), report.summary())
     tell("done", 1.0)
     return report

@@ -50,7 +50,7 @@ def stated_median_limit(
         return floor
     rng = np.random.default_rng(_SEED)
     whole, correction = joint_terms(result, correction)
-    J = np.array([_sensitivity(result, o, correction) for o in observations])
+    J = np.array([place_sensitivity(result, o.p_CR, correction) for o in observations])
     if shared is not None:
         J, whole = shared
     values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
@@ -193,13 +193,13 @@ def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observat
     return np.asarray(np.sqrt((1e-3 * result.sigma_position_mm) ** 2 + unknown))
 
 
-def _sensitivity(result: CalibrationResult, o: Observation, correction: ScannerCorrection | None) -> Array:
-    """How the base position of an observed centre moves with pose and, where there is one, correction (3, 6 + K)."""
-    p = np.asarray(result.X_BC @ o.p_CR)
+def place_sensitivity(result: CalibrationResult, p_CQ: Array, correction: ScannerCorrection | None) -> Array:
+    """How the base position of a scanned point moves with pose and, where there is one, correction (3, 6 + K)."""
+    p = np.asarray(result.X_BC @ p_CQ)
     J = np.hstack([-skew(p - result.X_BC.translation()), np.eye(3)])
     if correction is None:
         return np.asarray(J)
-    return np.hstack([J, np.outer(result.X_BC.rotation() @ o.p_CR, correction.terms(o.p_CR))])
+    return np.hstack([J, np.outer(result.X_BC.rotation() @ p_CQ, correction.terms(p_CQ))])
 
 
 MEASURED, SHEET, ASSUMED = "measured", "data sheet", "assumed"

@@ -9,7 +9,7 @@ import typer
 
 from weldcal.calibration.verified_pairs import PairsOptions, holds_scans
 from weldcal.calibration.verified_scans import VerifyOptions
-from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
+from weldcal.tools.cli.options import Call, FlangeOption, Outcome, command, option, switch
 from weldcal.tools.commands.hand_eye import (
     BoardOption,
     CameraPosesOption,
@@ -20,10 +20,12 @@ from weldcal.tools.commands.hand_eye import (
 )
 from weldcal.tools.verified import verify_dataset, verify_on_pairs
 
+OF_SCANS = "scanner-correction"
+
 
 @command(
     "verify",
-    keys=("robot-form", "camera-form", "intrinsics"),
+    keys=("robot-form", "camera-form", "intrinsics", OF_SCANS),
     options=("browser", "share"),
     defaults={"browser": False},
     short_help="Verify a calibration on scans that it did not use.",
@@ -63,7 +65,9 @@ def verify(
         str | None, option("--robot", "NAME", "The arm of joint angles; with --scenario: simulated or an address ...")
     ] = None,
     flange: FlangeOption = None,
-    scanner_correction: CorrectionOption = True,
+    correct: Annotated[
+        bool, switch("--correct", "Also write the pose shifted by what the new scans show, where that is no chance.")
+    ] = False,
     limit_mm: Annotated[
         float | None,
         option(
@@ -92,6 +96,8 @@ def verify(
         raise typer.BadParameter(
             "give a folder of new scans, touched points (--touch FILE) or a cell (--scenario NAME)"
         )
+    if correct and (dataset is None or board is not None or not holds_scans(dataset)):
+        raise typer.BadParameter("--correct is for scans of a flange")
     if touch is not None or scenario is not None:
         from weldcal.tools.commands.touch import live_touches_outcome, touches_outcome
     if scenario is not None:
@@ -101,7 +107,7 @@ def verify(
         return touches_outcome(call, result, touch)
     named = {"--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses}
     of_pairs = [(name, value) for name, value in named.items() if value is not None]
-    of_pairs += [("--as", f"{key}={value}") for key, value in call.reading.items()]
+    of_pairs += [("--as", f"{key}={value}") for key, value in call.reading.items() if key != OF_SCANS]
     if board is not None or not holds_scans(dataset):
         known = PairsOptions(
             mounting=mounting,
@@ -120,7 +126,13 @@ def verify(
         surplus = of_pairs[0][0] if of_pairs else "--mounting"
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
     asked = VerifyOptions(
-        flange=flange, robot=robot, correct_scanner=scanner_correction, limit_mm=limit_mm, pose=pose, seed=call.seed
+        flange=flange,
+        robot=robot,
+        correct_scanner=call.reading.get(OF_SCANS, True),
+        limit_mm=limit_mm,
+        pose=pose,
+        correct=correct,
+        seed=call.seed,
     )
     report = verify_dataset(result, dataset, call.folder("verify", dataset.resolve().name), asked, call.progress)
     summary = report.summary()

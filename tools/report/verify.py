@@ -29,6 +29,8 @@ from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed
 
 NONE = "not a verification"
+CORRECTED = "corrected"
+"""The folder of the shifted calibration in that of a verification."""
 ANY_LIMIT_MM = 0.5  # a choice: that of docs/first_hour/your_scans.md
 
 
@@ -132,10 +134,14 @@ class VerifyReport(VerifiedScans):
                 f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
                 " from the new solution. The vector is in the base, at the middle of these scans."
             )
+        if self.shift:
+            more["corrected"] = self.shift
         return FirstScreen(found, expected, self._next(), tuple(poses), more)
 
     def _next(self) -> Next:
         v, flange = self.verdict, ("--flange", self.flange) if self.flange else ()
+        if self.corrected is not None:
+            return Next(f"Verify the pose in {self.out / CORRECTED} on other scans before you use it.")
         held = None if self.offset is None else 1e3 * float(np.nanmedian(self.offset.new.held_out.position_m))
         if v.verdict == USE:
             return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
@@ -182,6 +188,7 @@ class VerifyReport(VerifiedScans):
             "warnings": list(self.warnings),
             "notes": list(self.notes),
             "X": self.result.X_BC.GetAsMatrix4().tolist(),
+            "X_corrected": None if self.corrected is None else self.corrected.X_BC.GetAsMatrix4().tolist(),
             **self._off(),
         }
 
