@@ -15,7 +15,7 @@ from tests.places import ROOT
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
     "code lines of calibration": 29_565,
-    "code lines of models": 6_059,
+    "code lines of models": 6_079,
     "code lines of systems": 19_159,
     "code lines of tools": 22_667,
     "code lines of welding": 9_527,
