@@ -41,7 +41,7 @@ PAPER_RADIUS_M = 0.031
 """Radius that the flange calibration paper searches for, though ISO 9409-1-50 is 63 mm across: the edge carries a 1 mm
 chamfer, so the outermost points lie between 30.5 mm (end of the flat face) and 31.5 mm, and 31 is their middle."""
 
-LEAST_RING_M, LARGEST_RING_M = 0.030, 0.250  # of an own circle: below, a scan hardly shows it; above, no arm carries it
+LEAST_RING_M, LARGEST_RING_M = 0.030, 0.250  # of an own circle: a scan hardly shows less, no arm carries more
 
 CIRCLE_SEGMENTS = 256
 """Default facets of a full turn: the chord of a 63 mm circle then lies at most 2.4 micrometres inside it."""
@@ -176,7 +176,7 @@ STANDARDS: dict[str, FlangeStandard] = {
 
 
 def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
-    """Return the circle that a name like "ring-90-63-76-6-m5" describes, with the first hole on x. Raises InputError."""
+    """Return the circle that a name such as "ring-90-63-76-6-m5" describes, its first hole on x. Raises InputError."""
     outer, bore, pitch = (1e-3 * float(own[key] or 0.0) for key in ("outer", "bore", "pitch"))
     if not LEAST_RING_M <= outer <= LARGEST_RING_M:
         low, high = 1e3 * LEAST_RING_M, 1e3 * LARGEST_RING_M
