@@ -35,7 +35,7 @@ _OWN = re.compile(
     r"ring-(?P<outer>\d+(?:\.\d+)?)-(?P<bore>\d+(?:\.\d+)?)"
     r"(?:-(?P<pitch>\d+(?:\.\d+)?)-(?P<holes>\d{1,2})-m(?P<thread>\d{1,2}))?"
 )
-"""A circle of one's own, as "ring-90-63" (outer diameter and bore, mm) or "ring-90-63-76-6-m5" (pitch circle, holes)."""
+"""A circle of one's own: "ring-90-63" (outer diameter and bore, mm), "ring-90-63-76-6-m5" (pitch circle, holes)."""
 
 PAPER_RADIUS_M = 0.031
 """Radius that the flange calibration paper searches for, though ISO 9409-1-50 is 63 mm across: the edge carries a 1 mm
