@@ -31,9 +31,17 @@ _CATALOGUE = re.compile(
     rf"(31[.,]5|\d{{2,3}})[\s\-_/\u2010-\u2015]+(\d{{1,2}}){_DASH}(?:x{_DASH})?m(\d{{1,2}})"
 )
 
+_OWN = re.compile(
+    r"ring-(?P<outer>\d+(?:\.\d+)?)-(?P<bore>\d+(?:\.\d+)?)"
+    r"(?:-(?P<pitch>\d+(?:\.\d+)?)-(?P<holes>\d{1,2})-m(?P<thread>\d{1,2}))?"
+)
+"""A circle of one's own: "ring-90-63" (outer diameter and bore, mm), "ring-90-63-76-6-m5" (pitch circle, holes)."""
+
 PAPER_RADIUS_M = 0.031
 """Radius that the flange calibration paper searches for, though ISO 9409-1-50 is 63 mm across: the edge carries a 1 mm
 chamfer, so the outermost points lie between 30.5 mm (end of the flat face) and 31.5 mm, and 31 is their middle."""
+
+LEAST_RING_M, LARGEST_RING_M = 0.030, 0.250  # of an own circle: a scan hardly shows less, no arm carries more
 
 CIRCLE_SEGMENTS = 256
 """Default facets of a full turn: the chord of a 63 mm circle then lies at most 2.4 micrometres inside it."""
@@ -167,9 +175,26 @@ STANDARDS: dict[str, FlangeStandard] = {
 """Every flange known by name."""
 
 
+def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
+    """Return the circle that a name such as "ring-90-63-76-6-m5" describes, its first hole on x. Raises InputError."""
+    outer, bore, pitch = (1e-3 * float(own[key] or 0.0) for key in ("outer", "bore", "pitch"))
+    if not LEAST_RING_M <= outer <= LARGEST_RING_M:
+        low, high = 1e3 * LEAST_RING_M, 1e3 * LARGEST_RING_M
+        raise InputError(f"The circle '{name}' must be {low:.0f} to {high:.0f} mm wide: ring-OUTER-BORE, in mm.")
+    ring = flange_ring(outer, bore, designation=name)
+    if not own["holes"]:
+        return ring
+    n, thread = int(own["holes"]), int(own["thread"])
+    angles = tuple(2.0 * math.pi * k / n for k in range(n))
+    return replace(
+        ring, pitch_circle_m=pitch, n_holes=n, thread=f"M{thread}", hole_m=1e-3 * thread, hole_angles_rad=angles
+    )
+
+
 def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStandard:
     """Return the flange of that designation, also as catalogues write it ("ISO 9409-1 - 50 - 4 - M6", "50-4-M6").
 
+    "ring-90-63" is a circle of one's own, 90 mm wide with a bore of 63 mm; "ring-90-63-76-6-m5" one with holes.
     `pin_angle_rad` moves the dowel hole, which is at 90 degrees otherwise.
 
     Raises InputError naming the known ones.
@@ -179,14 +204,15 @@ def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStanda
     plain = (
         f"iso9409-1-{iso[1].replace(',', '.')}-{iso[2]}-m{iso[3]}" if iso else plain.replace(" ", "-").replace(",", ".")
     )
-    flange = STANDARDS.get(plain)
+    own = _OWN.fullmatch(plain)
+    flange = STANDARDS.get(plain) if own is None else _own_circle(plain, own)
     if flange is None:
         if not name:
             raise InputError(
                 "No flange is named: write 'flange:' in dataset.yaml, or add --flange; known are"
                 f" {', '.join(STANDARDS)}."
             )
-        listed = f"use one of {', '.join(STANDARDS)}."
+        listed = f"use one of {', '.join(STANDARDS)}, or ring-OUTER-BORE in mm for a circle of your own."
         raise InputError(f"Flange '{name}' is not known: {did_you_mean(name, STANDARDS, listed)}")
     return flange if pin_angle_rad is None else replace(flange, pin_angle_rad=pin_angle_rad)
 

@@ -96,7 +96,7 @@ class ShortJobs:
 
         words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._folder), "--json"]
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr("weldcal.tools.commands.demo.run_scenario", short)
+            patched.setattr("weldcal.tools.commands.weld.run_scenario", short)
             finished = CliRunner().invoke(app, words)
         lines = finished.stdout.splitlines()
         summary = json.loads(lines[-1]) if lines else {}

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,10 @@ from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.solve import HandEyeResult, as_poses
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.calibration.recorded_hand_eye import solve_arrays
+from weldcal.calibration.verified_pairs import PairsOptions, holds_scans
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.cell import Cell
@@ -25,14 +29,13 @@ from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.wiring import Replacement
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.demo import run_procedure
-from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
+from weldcal.tools.procedure import run_procedure
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.calibration import CalibrationReport
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import VerifyReport
 from weldcal.tools.report.verify_pairs import PairsReport
+from weldcal.tools.verified import verify_dataset, verify_on_pairs
 
 Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"
@@ -74,11 +77,14 @@ def calibrate(
     Raises:
         InputError, TooFewPoses: the data cannot be used; the message says what to change.
     """
-    options: dict[str, Any] = {"robot": robot, "flange": flange, "correct_scanner": correct_scanner, "seed": seed}
-    if out is not None:
-        return calibrate_dataset(Path(folder), Path(out), **options)
-    with tempfile.TemporaryDirectory() as kept_for_now:
-        return calibrate_dataset(Path(folder), Path(kept_for_now), **options)
+    asked = FlangeOptions(robot=robot, flange=flange, correct_scanner=correct_scanner, seed=seed)
+    with _folder(out) as kept:
+        return calibrate_dataset(Path(folder), Path(kept), asked)
+
+
+def _folder(out: str | Path | None) -> AbstractContextManager[str | Path]:
+    """Return the folder of a result; None: one that is deleted again."""
+    return tempfile.TemporaryDirectory() if out is None else nullcontext(out)
 
 
 def verify(
@@ -104,13 +110,11 @@ def verify(
         InputError: the result or the data cannot be used.
     """
     if not holds_scans(Path(folder)):
-        return verify_on_pairs(
-            Path(result), Path(folder), None if out is None else Path(out), mounting=mounting, limit_mm=limit_mm
-        )
-    if out is not None:
-        return verify_dataset(Path(result), Path(folder), Path(out), limit_mm=limit_mm, flange=flange)
-    with tempfile.TemporaryDirectory() as kept_for_now:
-        return verify_dataset(Path(result), Path(folder), Path(kept_for_now), limit_mm=limit_mm, flange=flange)
+        known, there = PairsOptions(mounting=mounting), None if out is None else Path(out)
+        return verify_on_pairs(Path(result), Path(folder), there, known, limit_mm=limit_mm)
+    asked = VerifyOptions(limit_mm=limit_mm, flange=flange)
+    with _folder(out) as kept:
+        return verify_dataset(Path(result), Path(folder), Path(kept), asked)
 
 
 def read_cloud(file: str | Path, unit: str = "auto") -> Floats:

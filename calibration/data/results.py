@@ -1,14 +1,16 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
 import json
+import math
 import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
@@ -41,6 +43,44 @@ class PoseRecord:
     held_out_mm: float | None = None
     tilt_deg: float | None = None
     held_out_tilt_deg: float | None = None
+
+
+def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
+    """Compute median, mean, rms, p95, min, max by name (median, mean, p95, max without); NaN for no finite value."""
+    v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
+    of: dict[str, Callable[[Array], Any]] = {
+        "median": np.median,
+        "mean": np.mean,
+        "rms": lambda x: np.sqrt(np.mean(x**2)),
+        "p95": lambda x: np.percentile(x, 95),
+        "min": np.min,
+        "max": np.max,
+    }
+    chosen = names or ("median", "mean", "p95", "max")
+    return {name: float(of[name](v)) if len(v) else float("nan") for name in chosen}
+
+
+def known(value: float) -> float | None:
+    """Return the number for a JSON object; None where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
+    """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
+    s = statistics(np.degrees(tilts_rad))
+    return {k: known(s[k]) for k in ("median", "p95")}
+
+
+def pose_records(
+    ids: Sequence[str], used: NDArray[np.bool_], values: Mapping[str, Array], refused: Iterable[tuple[str, str]]
+) -> tuple[PoseRecord, ...]:
+    """The records of poses with their ``values`` (n,) by the record's field, then of those that were refused before."""
+    reasons = dict(refused)
+    records = []
+    for k, id in enumerate(ids):
+        numbers = {name: known(v[k]) for name, v in values.items()}
+        records.append(PoseRecord(id=id, used=bool(used[k]), reason=reasons.pop(id, ""), **numbers))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 @dataclass(frozen=True, kw_only=True)

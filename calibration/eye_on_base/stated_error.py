@@ -1,6 +1,6 @@
 """The error that a calibration states: the limit of the median error of new scans, and the budget of its sources."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.results import CalibrationResult, pose_records
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
@@ -50,7 +50,7 @@ def stated_median_limit(
         return floor
     rng = np.random.default_rng(_SEED)
     whole, correction = joint_terms(result, correction)
-    J = np.array([_sensitivity(result, o, correction) for o in observations])
+    J = np.array([place_sensitivity(result, o.p_CR, correction) for o in observations])
     if shared is not None:
         J, whole = shared
     values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
@@ -88,6 +88,43 @@ def joint_terms(
     if joint is None or correction is None or len(joint) != 6 + len(correction.values):
         return result.covariance, None
     return joint, correction
+
+
+def estimate_result(
+    e: CalibrationEstimate,
+    observations: Sequence[Observation],
+    refused: Iterable[tuple[str, str]],
+    X_FR: RigidTransform | None,
+    joints: Sequence[Array],
+    **more: Any,
+) -> CalibrationResult:
+    """Return an estimate as a result folder holds it.
+
+    Args:
+        observations: as measured (n).
+        refused: id and reason of each scan that is not used, outliers included.
+        X_FR: the feature in the flange; None for poses of the feature.
+        joints: joint angles of the inliers, rad, where they are known.
+        more: other fields of the result.
+    """
+    inliers = [o for o, keep in zip(observations, e.inliers, strict=True) if keep]
+    values = {
+        "residual_mm": 1e3 * e.position_residuals_m,
+        "held_out_mm": 1e3 * e.held_out.position_m,
+        "tilt_deg": np.degrees(e.tilt_residuals_rad),
+        "held_out_tilt_deg": np.degrees(e.held_out.tilt_rad),
+    }
+    fields: dict[str, Any] = {
+        "X_BC": e.X_BC,
+        "covariance": e.covariance,
+        "poses": pose_records([o.id for o in observations], e.inliers, values, refused),
+        "unobservable": e.unobservable,
+        "sigma_position_mm": 1e3 * e.sigma_position_m,
+        "joint_covariance": e.joint,
+        "orientations": orientations_of(inliers, X_FR),
+        "observed": observed_document(inliers, X_FR, joints),
+    }
+    return CalibrationResult(**fields | more)
 
 
 def observed_document(
@@ -156,13 +193,13 @@ def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observat
     return np.asarray(np.sqrt((1e-3 * result.sigma_position_mm) ** 2 + unknown))
 
 
-def _sensitivity(result: CalibrationResult, o: Observation, correction: ScannerCorrection | None) -> Array:
-    """How the base position of an observed centre moves with pose and, where there is one, correction (3, 6 + K)."""
-    p = np.asarray(result.X_BC @ o.p_CR)
+def place_sensitivity(result: CalibrationResult, p_CQ: Array, correction: ScannerCorrection | None) -> Array:
+    """How the base position of a scanned point moves with pose and, where there is one, correction (3, 6 + K)."""
+    p = np.asarray(result.X_BC @ p_CQ)
     J = np.hstack([-skew(p - result.X_BC.translation()), np.eye(3)])
     if correction is None:
         return np.asarray(J)
-    return np.hstack([J, np.outer(result.X_BC.rotation() @ o.p_CR, correction.terms(o.p_CR))])
+    return np.hstack([J, np.outer(result.X_BC.rotation() @ p_CQ, correction.terms(p_CQ))])
 
 
 MEASURED, SHEET, ASSUMED = "measured", "data sheet", "assumed"

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,17 @@ class Provenance:
 
     source: str
     sha256: str
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, or of the files of a folder in the order of their names."""
+    if path.is_file():
+        return sha256(path.read_bytes()).hexdigest()
+    whole = sha256()
+    for one in sorted(p for p in path.rglob("*") if p.is_file()):
+        whole.update(one.relative_to(path).as_posix().encode())
+        whole.update(one.read_bytes())
+    return whole.hexdigest()
 
 
 def export_drake_directive(X: RigidTransform, parent: str, child: str) -> str:

@@ -11,12 +11,13 @@ import sys
 import pytest
 
 from tests.places import ROOT
+from weldcal.tools.procedure import RUNNERS, runner_of
 
 # Loaded before the arm moves; a figure that shrinks by much gets a lower bound.
 STARTS = {
     "calibrate": ("import weldcal.tools.commands.calibrate", 18_500),
     "demo": (
-        "from weldcal.tools.commands.demo import kind_of, runner_of\n"
+        "from weldcal.tools.procedure import kind_of, runner_of\n"
         "from weldcal.systems.scenario.loading import load_scenario\n"
         "runner_of(kind_of(load_scenario('s_groove')))",
         48_500,
@@ -42,3 +43,7 @@ def test_a_job_that_does_not_run_is_not_imported() -> None:
     assert "weldcal.systems.jobs.weld.job" in finished.stdout.split()
     for other in ("jobs.motion.job", "jobs.profiler.job", "jobs.tablet.job", "drivers.ur.rtde", "drivers.power.modbus"):
         assert f"weldcal.systems.{other}" not in finished.stdout.split(), other
+
+
+def test_every_job_finds_what_runs_it() -> None:
+    assert all(callable(runner_of(key)) for key in (*RUNNERS, "a job without a command"))

@@ -4,8 +4,8 @@ import numpy as np
 
 from tests.figures.harness import Run, figure
 from tests.worlds.touch import touch_world
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.tools.report.render import statistics
 
 
 @figure("touch", "how often points that the robot touches lie in the 95 % region that their calibration states")

@@ -32,8 +32,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.mounting_live import calibrate_carried
+from weldcal.tools.recorded import calibrate_dataset
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"

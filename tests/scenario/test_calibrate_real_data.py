@@ -21,9 +21,10 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.calibration import CalibrationReport
 
 DATA = SHARED_DATA / "flange"
@@ -72,7 +73,7 @@ def test_the_scanner_of_the_aubo_is_corrected_as_its_hole_circle_and_the_robot_b
     assert any(w == scanner.sentence for w in aubo.result.warnings)
     # the centres are those that the scanner saw
     row = (aubo.out / "centres.csv").read_text().splitlines()[1].split(",")
-    assert np.allclose([float(v) for v in row[1:4]], aubo.fits[row[0]].center_C, atol=1e-9)
+    assert np.allclose([float(v) for v in row[1:4]], aubo.seen.fits[row[0]].center_C, atol=1e-9)
 
 
 def test_pairs_without_clouds_are_not_corrected_and_the_result_says_what_motion_asks(ur10e: CalibrationReport) -> None:
@@ -284,7 +285,7 @@ def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
         known is not None
     )  # the drilled pattern of this arm is turned by a degree or so: 0.85 to 0.91 in other people's hands
     assert known[0] == pytest.approx(0.88, abs=0.1)
-    report = calibrate_dataset(folder, tmp_path / "out", axis_turn_deg=known[0] if turn else None)
+    report = calibrate_dataset(folder, tmp_path / "out", FlangeOptions(axis_turn_deg=known[0] if turn else None))
     assert f"From {'one scan' if n == 1 else f'{n} scans'} only" in report.result.warnings[0]
     assert np.isfinite(report.result.held_out_mm["median"]) == (n == 3)
     assert load_result(tmp_path / "out").covariance.shape == (6, 6)
@@ -296,8 +297,8 @@ def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
 
 
 def test_one_scan_of_a_flange_with_slots_is_calibrated(tmp_path: Path) -> None:
-    report = calibrate_dataset(DATA / "franka_phoxi_m", tmp_path / "out", axis_turn_deg=0.0)
-    pattern = report.patterns["pose04"]
+    report = calibrate_dataset(DATA / "franka_phoxi_m", tmp_path / "out", FlangeOptions(axis_turn_deg=0.0))
+    pattern = report.seen.patterns["pose04"]
     assert pattern.turn_known
     assert pattern.rms_m < 2e-4
     assert abs(pattern.ratio - 1.0) < 0.01
@@ -306,7 +307,7 @@ def test_one_scan_of_a_flange_with_slots_is_calibrated(tmp_path: Path) -> None:
 def _as_seen(aubo: CalibrationReport) -> list[Observation]:
     """The sightings of all scans without a correction of the scanner."""
     X_BR = {o.id: o.X_BR for o in aubo.observations}
-    return [Observation(id, X_BR[id], fit.center_C) for id, fit in aubo.fits.items()]
+    return [Observation(id, X_BR[id], fit.center_C) for id, fit in aubo.seen.fits.items()]
 
 
 def _list_of_pairs(folder: Path, seed: int, n: int, gross: dict[int, float], *, unit: str, turned: bool) -> None:

@@ -29,9 +29,9 @@ from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Truth
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.run import JobRun
 from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
 from weldcal.welding.record.weld_log import load_weld_log

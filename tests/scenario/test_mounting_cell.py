@@ -28,9 +28,9 @@ from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import kind_of
 from weldcal.tools.commands.mounting_live import calibrate_carried, run_mounting_live
 from weldcal.tools.commands.run import JobRun
+from weldcal.tools.procedure import kind_of
 from weldcal.tools.report.mounting import MountingReport
 from weldcal.tools.report.run import RunOptions
 

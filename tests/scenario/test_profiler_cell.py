@@ -24,8 +24,8 @@ from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import kind_of, runner_of
 from weldcal.tools.commands.profiler.live import run_profiler_live
+from weldcal.tools.procedure import kind_of, runner_of
 from weldcal.tools.report.profiler_live import ProfilerLive
 from weldcal.tools.report.run import RunOptions
 

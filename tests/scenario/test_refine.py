@@ -18,14 +18,15 @@ from weldcal.calibration.data.results import load_result, save_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.calibration.refinement.kinematics_choice import kinematics_text
 from weldcal.calibration.refinement.kinematics_fit import KinematicsFit, arm_errors
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.recorded import calibrate_dataset
+from weldcal.tools.verified import verify_dataset
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +87,12 @@ def test_refined_joints_come_as_a_kinematics_file_that_verify_uses(tmp_path: Pat
     world = station(10, links=False)
     data = _with_angles(tmp_path / "scans", world.observations, world.q)
     new = _with_angles(tmp_path / "new", world.new, world.new_q)
-    found = calibrate_dataset(data, tmp_path / "joints", refine="joints")
+    found = calibrate_dataset(data, tmp_path / "joints", FlangeOptions(refine="joints"))
     assert found.refinement is not None
     assert found.refinement["accepted"], found.refinement["sentence"]
     assert "another robot" not in found.refinement["sentence"]
     assert [e["name"].split()[1] for e in found.refinement["errors"]] == ["offset"] * 4
-    calibrate_dataset(data, tmp_path / "plain", correct_scanner=False)
+    calibrate_dataset(data, tmp_path / "plain", FlangeOptions(correct_scanner=False))
     refined, plain = (_error(tmp_path / name, new, tmp_path / f"v_{name}") for name in ("joints", "plain"))
     assert refined[0] < 0.5 * plain[0]
     assert refined[0] < refined[1] < 0.5 * plain[1]
@@ -100,7 +101,7 @@ def test_refined_joints_come_as_a_kinematics_file_that_verify_uses(tmp_path: Pat
     assert any("no joint angles" in w for w in verify_dataset(tmp_path / "joints", bare, tmp_path / "v_bare").warnings)
     # the corrected arm takes errors no more: its kinematics are the file's
     with pytest.raises(InputError, match=r"--kinematics"):
-        calibrate_dataset(data, tmp_path / "again", refine="joints", kinematics=_turned(tmp_path))
+        calibrate_dataset(data, tmp_path / "again", FlangeOptions(refine="joints", kinematics=_turned(tmp_path)))
 
 
 def _turned(folder: Path) -> Path:
@@ -125,11 +126,11 @@ def _turned(folder: Path) -> Path:
 def test_joint_angles_are_asked_for_and_a_dataset_without_them_is_named(tmp_path: Path) -> None:
     data = _pairs(tmp_path / "scans", station(7, links=False).observations)
     with pytest.raises(DatasetError, match="add the columns q1 to q6"):
-        calibrate_dataset(data, tmp_path / "out", refine="joints")
+        calibrate_dataset(data, tmp_path / "out", FlangeOptions(refine="joints"))
     with pytest.raises(InputError, match="use --refine local"):
-        calibrate_dataset(data, tmp_path / "out", refine="joints", robot="aubo_i5")
+        calibrate_dataset(data, tmp_path / "out", FlangeOptions(refine="joints", robot="aubo_i5"))
 
 
 def test_a_refinement_that_does_not_exist_is_named_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Choose one of local, joints, links"):
-        calibrate_dataset(tmp_path / "absent", tmp_path / "out", refine="magic")
+        calibrate_dataset(tmp_path / "absent", tmp_path / "out", FlangeOptions(refine="magic"))

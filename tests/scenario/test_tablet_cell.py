@@ -22,9 +22,9 @@ from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
-from weldcal.tools.commands.demo import kind_of, run_procedure
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.weld import known_camera, run_scenario
+from weldcal.tools.procedure import kind_of, run_procedure
 from weldcal.tools.report.run import RunOptions
 
 # six landmarks and quick descents: half of the shipped scenario's time

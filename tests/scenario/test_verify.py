@@ -23,13 +23,14 @@ from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.verify import VerifyReport
+from weldcal.tools.verified import verify_dataset
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
@@ -77,7 +78,7 @@ def _result(folder: Path, result: CalibrationResult) -> Path:
 def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(verified: VerifyReport) -> None:
     d = verified.summary()
     figures = {"position_error_mm", "tilt_deg", "per_pose", "warnings"}
-    offset = {"X", "off_mm", "off_xyz_mm", "off_sigma_mm", "off_deg", "new", "notes"}
+    offset = {"X", "X_corrected", "off_mm", "off_xyz_mm", "off_sigma_mm", "off_deg", "new", "notes"}
     assert set(d) == {"state", "verdict", "limit_mm", "reason"} | figures | offset
     assert d["verdict"] == "use with care"  # because the orientations hardly vary
     # nine scans: without one of them the others decide against the correction, and that held-out error sets the limit
@@ -157,6 +158,39 @@ def test_a_scanner_that_was_pushed_shows(halves: tuple[Path, Path], tmp_path: Pa
     assert report.verdict.verdict == "do not use"
 
 
+def test_a_scanner_that_was_pushed_is_corrected_by_new_scans(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    good = load_result(halves[0])
+    pushed = RigidTransform(good.X_BC.rotation(), good.X_BC.translation() + np.array([0.0, 0.003, 0.0]))
+    result, few = (
+        _result(tmp_path / "pushed", replace(good, X_BC=pushed)),
+        _part(AUBO, tmp_path / "new", slice(1, 12, 2)),
+    )
+    done = CliRunner().invoke(
+        app, ["verify", str(result), str(few), "--correct", "--out", str(tmp_path / "out"), "--json"]
+    )
+    said = json.loads(done.stdout.splitlines()[-1])
+    assert said["verdict"] == DO_NOT
+    corrected = load_result(tmp_path / "out" / "corrected")
+    assert np.allclose(said["X_corrected"], corrected.X_BC.GetAsMatrix4())
+    assert np.linalg.norm(corrected.X_BC.translation() - good.X_BC.translation()) < 0.25e-3
+    assert "which 6 new scans show" in corrected.warnings[-1]
+    # on scans that neither the calibration nor the shift has seen
+    others = _part(AUBO, tmp_path / "others", slice(13, None, 2))
+    assert verify_dataset(tmp_path / "out" / "corrected", others, tmp_path / "again").position_error_mm["median"] < 0.4
+    # the scans of the shift are no verification of it
+    assert all(p.used_before for p in verify_dataset(tmp_path / "out/corrected", few, tmp_path / "same").poses)
+
+
+def test_a_good_calibration_is_not_corrected(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    report = verify_dataset(*halves, tmp_path / "out", VerifyOptions(correct=True))
+    assert report.corrected is None
+    assert report.first.more["corrected"].startswith("Not corrected: an offset of 0.")
+    assert not (tmp_path / "out" / "corrected").exists()
+    refused = CliRunner().invoke(app, ["verify", str(halves[0]), "--touch", "touches.csv", "--correct"])
+    assert refused.exit_code == 2
+    assert "--correct is for scans of a flange" in refused.output
+
+
 def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tmp_path: Path) -> None:
     seen = _part(AUBO, tmp_path / "seen", slice(0, 3))  # the first and the third were given, the second was not
     report = verify_dataset(halves[0] / "calibration.yaml", seen, tmp_path / "out")
@@ -190,7 +224,7 @@ def test_another_robot_flange_or_scanner_is_named(halves: tuple[Path, Path], tmp
     few = _few(halves, tmp_path / "few", 1)
     header = (few / "dataset.yaml").read_text()
     (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5").replace("phoxi_s", "phoxi_m"))
-    report = verify_dataset(halves[0], few, tmp_path / "out", flange="tool-ring-63")
+    report = verify_dataset(halves[0], few, tmp_path / "out", VerifyOptions(flange="tool-ring-63"))
     for what, was, now in (
         ("robot", "aubo_i5", "ur5"),
         ("flange", "iso9409-1-50-4-m6", "tool-ring-63"),
@@ -204,7 +238,7 @@ def test_another_arm_is_the_first_words_of_a_verdict(halves: tuple[Path, Path], 
     header = (few / "dataset.yaml").read_text()
     (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5"))
     named = "The calibration was made with the robot 'aubo_i5', these scans with 'ur5'."
-    report = verify_dataset(halves[0], few, tmp_path / "out", limit_mm=1e-3)
+    report = verify_dataset(halves[0], few, tmp_path / "out", VerifyOptions(limit_mm=1e-3))
     assert report.verdict.verdict == DO_NOT
     assert report.verdict.reason.startswith(named)
     assert report.warnings[0].startswith(named)

@@ -10,10 +10,11 @@ from typer.testing import CliRunner
 
 from tests.documents.scans import write_scans
 from weldcal.calibration.doctor.case import read_case
+from weldcal.calibration.recorded_flange import FlangeOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.doctor import diagnose_dataset
+from weldcal.tools.recorded import calibrate_dataset
 
 
 def test_doctor_names_the_scale_that_calibrate_names(tmp_path: Path) -> None:
@@ -50,9 +51,9 @@ def test_a_missing_flange_is_said_before_any_cloud(
     monkeypatch.setattr("weldcal.calibration.data.dataset.digest", digest)
     wanted = r"did you mean that of the ur10e\? Add --flange iso9409-1-50-4-m6, or write 'flange: iso9409-1-50-4-m6'"
     with pytest.raises(InputError, match=wanted):
-        calibrate_dataset(data, tmp_path / "out", robot=None if plain else "ur10e")
+        calibrate_dataset(data, tmp_path / "out", FlangeOptions(robot=None if plain else "ur10e"))
     with pytest.raises(InputError, match="No flange is named"):
         diagnose_dataset(data, None, 0)
     with pytest.raises(InputError, match="Flange '50-7-M6' is not known"):
-        calibrate_dataset(data, tmp_path / "out", flange="50-7-M6")
+        calibrate_dataset(data, tmp_path / "out", FlangeOptions(flange="50-7-M6"))
     assert read == []

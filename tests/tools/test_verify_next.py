@@ -16,7 +16,7 @@ from tests.calibration.hand_eye.stated_forms import truth, write
 from tests.documents.scans import X_BC, write_scans
 from tests.tools.test_verify_pairs import moved, pairs
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.recorded import calibrate_dataset
 
 TRUTH = np.asarray(X_BC.GetAsMatrix4())
 FLANGE = "iso9409-1-50-4-m6"

@@ -19,11 +19,11 @@ from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.hand_eye.pairs.judging import judge_pose
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig
+from weldcal.calibration.verified_pairs import PairsOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.commands.verify_pairs import verify_on_pairs
 from weldcal.tools.report.verify_pairs import CANNOT_TELL, PairsReport
+from weldcal.tools.verified import verify_dataset, verify_on_pairs
 
 Array = NDArray[np.float64]
 NOISE_RAD, NOISE_M = np.radians(0.05), 3e-4
@@ -61,8 +61,8 @@ def moved(X: Array, mm: float, seed: int) -> Array:
     return out
 
 
-def verdict(result: Path, data: Path, **options: object) -> PairsReport:
-    return verify_on_pairs(result, data, None, **options)  # type: ignore[arg-type]
+def verdict(result: Path, data: Path, limit_mm: float | None = None, mounting: str | None = None) -> PairsReport:
+    return verify_on_pairs(result, data, None, PairsOptions(mounting=mounting), limit_mm=limit_mm)
 
 
 @pytest.mark.parametrize("form", FORMS)

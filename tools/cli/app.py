@@ -85,6 +85,10 @@ def _typer_command(name: str, entry: Entry) -> Any:
     return typer.main.get_command(alone)
 
 
+YES_NO = ("motions", "scanner-correction")
+"""Keys of --as that were options without a value."""
+
+
 class KeyedCommand(TyperCommand):
     """A command that names the key of --as for an option that became one."""
 
@@ -94,9 +98,13 @@ class KeyedCommand(TyperCommand):
         """Refuses an earlier option with the words that take its place, as wrong usage."""
         for after, word in enumerate(args, 1):
             name, attached, value = word.partition("=")
-            if name.startswith("--") and name[2:] in self.keys:
-                value = value if attached else "yes" if name == "--motions" else "".join(args[after : after + 1])
-                ctx.fail(f"The option {name} is a key of --as now: write --as {shlex.quote(f'{name[2:]}={value}')}.")
+            key = name[2:].removeprefix("no-")
+            if name.startswith("--") and key in self.keys:
+                if key in YES_NO:
+                    value = "no" if name.startswith("--no-") else "yes"
+                elif not attached:
+                    value = "".join(args[after : after + 1])
+                ctx.fail(f"The option {name} is a key of --as now: write --as {shlex.quote(f'{key}={value}')}.")
         return super().parse_args(ctx, args)
 
 

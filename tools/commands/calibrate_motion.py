@@ -15,13 +15,12 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
 from weldcal.models.robots import stated_flange
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report, motion_result
-from weldcal.tools.report.render import csv_text, write_atomic
+from weldcal.tools.report.render import check_folder, csv_text, write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 _MOST_TURNED = 50  # poses whose orientations are compared
@@ -70,8 +69,7 @@ def calibrate_motion(
     started = time.monotonic()
     check_limit(limit_mm)
     tell: Progress = progress or (lambda stage, fraction: None)
-    if Path(out).exists() and not Path(out).is_dir():
-        raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    check_folder(Path(out))
     data = load_motion_dataset(Path(folder), robot=robot)
     standard = stated_flange(flange or data.header.flange, data.header.robot)
     motion = ContinuousMotion(data.stream, inverted=data.in_hand)

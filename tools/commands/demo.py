@@ -1,18 +1,16 @@
 """weldcal demo and calibrate --scenario: run the job of a scenario with the command that is made for it."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
-from weldcal.systems.jobs.job import job_of
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.commands.weld import run_calibration_live, run_scenario
+from weldcal.tools.commands.weld import run_calibration_live
+from weldcal.tools.procedure import kind_of, run_procedure, runner_of
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions, run_document
 
@@ -38,55 +36,6 @@ def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = D
     options = run_options(call, "demo", named_once(name, scenario, DEMO_SCENARIO))
     found = run_procedure(options, call.progress)
     return Outcome(found.summary(), first=getattr(found, "first", None))
-
-
-class RunResult(Protocol):
-    """The result of every run: a folder and a JSON object."""
-
-    @property
-    def folder(self) -> Path:
-        """The result folder."""
-
-    def summary(self) -> dict[str, object]:
-        """Return the JSON object."""
-
-
-Runner = Callable[[Scenario, RunOptions, Progress], RunResult]
-
-
-def runner_of(key: str) -> Runner:
-    """Return what runs the job with this key; imports it."""
-    runner: Runner = run_any
-    match key:
-        case "":
-            runner = run_scenario
-        case "motion":
-            from weldcal.tools.commands.motion_live import run_motion_live as runner
-        case "mounting":
-            from weldcal.tools.commands.mounting_live import run_mounting_live as runner
-        case "profiler_job":
-            from weldcal.tools.commands.profiler.live import run_profiler_live as runner
-        case "tablet":
-            from weldcal.tools.commands.tablet.demo import run_tablet_demo as runner
-        case "touch":
-            from weldcal.tools.commands.touch import run_touches as runner
-    return runner
-
-
-def kind_of(scenario: Scenario) -> str:
-    """Return the key of the scenario's job; empty for the weld job."""
-    return job_of(scenario).key
-
-
-def run_procedure(options: RunOptions, progress: Progress) -> RunResult:
-    """Run a scenario's job; for a job without a command, only its state and a recording are written.
-
-    Raises:
-        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be run; nothing has been
-            written.
-    """
-    scenario = load_scenario(options.scenario)
-    return runner_of(kind_of(scenario))(scenario, options, progress)
 
 
 @dataclass(frozen=True, eq=False)

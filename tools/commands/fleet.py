@@ -8,14 +8,16 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from weldcal.calibration.recorded_flange import FlangeOptions
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
-from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
+from weldcal.tools.recorded import calibrate_dataset
 from weldcal.tools.report.first_screen import CARE, DO_NOT
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic, write_json
+from weldcal.tools.verified import verify_dataset
 
 HEADER = "dataset.yaml"
 FAILED = "failed"
@@ -128,14 +130,14 @@ def find_cells(folder: Path) -> dict[str, dict[str, Path]]:
 
 def calibrate_one(dataset: str, out: str, seed: int) -> Mapping[str, object]:
     """One task: calibrate a dataset; the JSON object of `calibrate`, without the time it took."""
-    found = dict(calibrate_dataset(Path(dataset), Path(out), seed=seed).summary())
+    found = dict(calibrate_dataset(Path(dataset), Path(out), FlangeOptions(seed=seed)).summary())
     found.pop("seconds")
     return found
 
 
 def verify_one(result: str, dataset: str, out: str, limit_mm: float | None, seed: int) -> Mapping[str, object]:
     """One task: verify a calibration on a dataset; the JSON object of `verify`."""
-    return verify_dataset(Path(result), Path(dataset), Path(out), limit_mm=limit_mm, seed=seed).summary()
+    return verify_dataset(Path(result), Path(dataset), Path(out), VerifyOptions(limit_mm=limit_mm, seed=seed)).summary()
 
 
 def _step(farm: Farm, what: str) -> Farm:

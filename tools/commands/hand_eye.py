@@ -2,13 +2,12 @@
 
 import time
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
+from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures.boards import FORMS
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, Say, calibrate_recorded, stated_forms
@@ -178,14 +177,3 @@ def run_hand_eye(
     report = HandEyeReport(**vars(found), files=files, seconds=seconds, limit_mm=limit_mm, folder=out)
     write_atomic(out / "report.html", hand_eye_report(report, file.name, provenance.sha256))
     return report
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file, or of the files of a folder in the order of their names."""
-    if path.is_file():
-        return sha256(path.read_bytes()).hexdigest()
-    whole = sha256()
-    for one in sorted(p for p in path.rglob("*") if p.is_file()):
-        whole.update(one.relative_to(path).as_posix().encode())
-        whole.update(one.read_bytes())
-    return whole.hexdigest()

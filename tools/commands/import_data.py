@@ -20,6 +20,7 @@ from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
+from weldcal.calibration.verified_pairs import holds_scans
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic, write_npz
@@ -34,7 +35,6 @@ from weldcal.tools.commands.hand_eye import (
     UnitOption,
     stated_lists,
 )
-from weldcal.tools.commands.verify_pairs import holds_scans
 from weldcal.tools.report.render import csv_text
 
 PAIRS_FILE, TABLE_FILE = "pairs.npz", "table.csv"

@@ -34,7 +34,7 @@ from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 from weldcal.tools.report.monitor import MonitorReport, drift_document, monitor_page
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import check_folder, write_atomic
 from weldcal.tools.report.run import RunOptions
 
 _STILLS = 15  # frames before and after a change that show what stands still
@@ -158,8 +158,7 @@ def monitor_recording(
     rate_checked(false_alarms_per_hour)
     if fused and body is None:
         raise InputError("A fused model is one of a link: name it with --body.")
-    if Path(out).exists() and not Path(out).is_dir():
-        raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    check_folder(Path(out))
     result = load_result(Path(calibration))
     data = load_motion_dataset(Path(folder), robot=read_header(Path(folder) / "dataset.yaml").robot or result.robot)
     if data.in_hand:

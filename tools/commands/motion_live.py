@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
+from weldcal.calibration.data.results import CalibrationResult, export_all, save_result, statistics
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
@@ -19,7 +19,7 @@ from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_result, motion_screen
 from weldcal.tools.report.page import TableRows, page_html
-from weldcal.tools.report.render import statistics, write_atomic
+from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
 

@@ -15,7 +15,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.commands.run import run_job
-from weldcal.tools.report.render import csv_text, write_atomic, write_json
+from weldcal.tools.report.render import check_folder, csv_text, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import TouchReport, touch_page
 
@@ -29,8 +29,7 @@ def verify_touches(result: Path, touches: Path, out: Path) -> TouchReport:
         InputError: the result, the table or the output folder cannot be used; nothing is written.
     """
     out, result = Path(out), Path(result)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"'{out}' is a file. Give a folder for the verification.")
+    check_folder(out, "verification")
     calibration = load_result(result)
     read = read_touches(Path(touches), correction_from_document(calibration.scanner_correction))
     folder = result if result.is_dir() else result.parent

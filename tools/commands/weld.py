@@ -11,10 +11,9 @@ import typer
 
 from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result
+from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
 from weldcal.calibration.data.writing import save_dataset
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
-from weldcal.calibration.eye_on_base.stated_error import observed_document, orientations_of
+from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result, write_apart
 from weldcal.systems.cell import Cell
@@ -314,46 +313,26 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
     estimate, refinement = status.estimate, status.refinement
     if estimate is None:
         return None
-    inliers = [o for o, keep in zip(status.observations, estimate.inliers, strict=True) if keep]
-    scanner = cell.scenario.scanner_config()
-    records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
-    records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
-    return CalibrationResult(
-        X_BC=estimate.X_BC,
-        covariance=estimate.covariance,
+    scanner, rows = cell.scenario.scanner_config(), zip(status.observations, estimate.inliers, strict=True)
+    outliers = [(o.id, "it disagrees with the other poses") for o, keep in rows if not keep]
+    return estimate_result(
+        estimate,
+        status.observations,
+        [*outliers, *status.refused],
+        cell.job.X_FR,
+        [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep],
         held_out_mm=live_errors(1e3 * estimate.held_out.position_m),
         tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
-        poses=tuple(records),
-        unobservable=estimate.unobservable,
         warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
         robot=cell.scenario.arm,
         flange=cell.scenario.calibration.feature,
         scanner="" if scanner is None else scanner.scanner().name,
-        sigma_position_mm=1e3 * estimate.sigma_position_m,
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
         scanner_correction=None if estimate.correction is None else estimate.correction.document(),
-        joint_covariance=estimate.joint,
-        orientations=orientations_of(inliers, cell.job.X_FR),
-        observed=observed_document(
-            inliers, cell.job.X_FR, [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep]
-        ),
         local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
         arm_errors=None if refinement is None else refinement.arm_errors,
         kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
-    )
-
-
-def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
-    used = bool(estimate.inliers[k])
-    return PoseRecord(
-        id=id,
-        used=used,
-        reason="" if used else "it disagrees with the other poses",
-        residual_mm=float(1e3 * estimate.position_residuals_m[k]),
-        held_out_mm=float(1e3 * estimate.held_out.position_m[k]),
-        tilt_deg=float(np.degrees(estimate.tilt_residuals_rad[k])),
-        held_out_tilt_deg=float(np.degrees(estimate.held_out.tilt_rad[k])),
     )
 
 

@@ -1,7 +1,7 @@
 """The result of `weldcal calibrate` and its page, with its plots and tables."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,23 +10,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from weldcal.calibration.data.results import (
-    RESULT_FILE,
-    CalibrationResult,
-    PoseRecord,
-    correction_note,
-    export_ros2,
-    matrix4,
-)
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, export_ros2, matrix4
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance, sigma_at
-from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.stated_error import USUAL_SCALE, ErrorBudget, error_budget
-from weldcal.calibration.eye_on_base.validation import Convergence, bootstrap_interval, mean_interval, weakest_place
+from weldcal.calibration.eye_on_base.validation import bootstrap_interval, mean_interval, weakest_place
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
-from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.recorded_flange import RecordedFlange
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
@@ -59,25 +50,7 @@ from weldcal.tools.report.pictures import (
     subplots,
     svg,
 )
-from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
-
-
-def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
-    """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
-    s = statistics(np.degrees(tilts_rad))
-    return {k: known(s[k]) for k in ("median", "p95")}
-
-
-def pose_records(
-    ids: Sequence[str], used: NDArray[np.bool_], values: Mapping[str, Array], refused: Iterable[tuple[str, str]]
-) -> tuple[PoseRecord, ...]:
-    """The records of poses with their ``values`` (n,) by the record's field, then of those that were refused before."""
-    reasons = dict(refused)
-    records = []
-    for k, id in enumerate(ids):
-        numbers = {name: known(v[k]) for name, v in values.items()}
-        records.append(PoseRecord(id=id, used=bool(used[k]), reason=reasons.pop(id, ""), **numbers))
-    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
+from weldcal.tools.report.render import fixed, render, sigma_rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,31 +82,12 @@ class Algorithm1Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationReport:
-    """The result of `weldcal calibrate`: the estimate, the records written, and the folder.
+class CalibrationReport(RecordedFlange):
+    """The result of `weldcal calibrate`, and its folder. ``limit_mm`` is the error that the job allows, or None."""
 
-    ``observations`` include the scanner correction where one was accepted. ``notes`` say in which form the dataset was
-    read. ``clouds`` are each scan's points (N, 3) m of C about its flange. ``limit_mm`` is the error that the job
-    allows (None: not stated).
-    """
-
-    result: CalibrationResult
-    estimate: CalibrationEstimate
-    observations: tuple[Observation, ...]
-    scanner: ScannerVerdict | None
-    fits: dict[str, FlangeFit]
-    refused: tuple[tuple[str, str], ...]
-    outliers: tuple[str, ...]
     algorithm1: Algorithm1Outcome | None
-    convergence: Convergence
-    k_fold_mm: dict[str, float]
     seconds: float
     out: Path
-    advice: tuple[str, ...] = ()
-    patterns: dict[str, HolePattern] = field(default_factory=dict)
-    clouds: Mapping[str, Array] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    refinement: dict[str, Any] | None = None
     limit_mm: float | None = None
 
     @property
@@ -253,7 +207,7 @@ class CalibrationReport:
             "notes": list(self.notes),
             "work_point": self.work_point.document(),
             "error_budget": self.budget.document(),
-            "features": feature_residuals(self.fits, self.patterns),
+            "features": feature_residuals(self.seen.fits, self.seen.patterns),
             **({} if self.refinement is None else {"refinement": self.refinement}),
             "algorithm1": (
                 None
@@ -331,7 +285,7 @@ def fit_cells(fit: FlangeFit | None) -> tuple[str, str]:
 
 def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     """Return the whole report as one self-contained HTML text."""
-    r = report.result
+    r, seen = report.result, report.seen
     used = report.estimate.inliers
     kept = [o for o, keep in zip(report.observations, used, strict=True) if keep]
     p_B = np.array([o.p_BR for o in kept])
@@ -343,16 +297,16 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         dataset=dataset,
         interval=report.held_out_interval_mm,
         judged=bool(np.isfinite(r.held_out_mm["median"])),
-        fits=bool(report.fits),
+        fits=bool(seen.fits),
         r=r,
         n_used=int(used.sum()),
         n_total=len(r.poses),
         work_sigma_mm=work_sigma,
         pose_rows=_pose_table(report),
-        feature_rows=feature_table(report.fits, report.patterns),
+        feature_rows=feature_table(seen.fits, seen.patterns),
         feature_header=HEADER,
-        scans=scan_pictures(report.clouds, report.fits) if report.fits and report.clouds else None,
-        n_scans=min(len(report.fits), MOST_SCANS),
+        scans=scan_pictures(seen.clouds, seen.fits) if seen.fits and seen.clouds else None,
+        n_scans=min(len(seen.fits), MOST_SCANS),
         refused=report.refused,
         first=report.first,
         pose_facts=[
@@ -397,7 +351,7 @@ def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
                 fixed(p.held_out_mm, 3),
                 fixed(p.residual_mm, 3),
                 fixed(p.held_out_tilt_deg, 3),
-                *fit_cells(report.fits.get(p.id)),
+                *fit_cells(report.seen.fits.get(p.id)),
                 p.reason,
             )
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
+from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2, statistics
 from weldcal.models.workpieces.part import Part
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
@@ -35,7 +35,7 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, TRUTH, millimetres, plain, subplots, svg
-from weldcal.tools.report.render import fixed, render, sigma_rows, statistics
+from weldcal.tools.report.render import fixed, render, sigma_rows
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 from weldcal.tools.report.weld import (
     CalibrationError,

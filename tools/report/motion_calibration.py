@@ -7,12 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, software_version, target_document
+from weldcal.calibration.data.results import (
+    CalibrationResult,
+    export_ros2,
+    known,
+    matrix4,
+    pose_records,
+    software_version,
+    statistics,
+    target_document,
+    tilt_summary,
+)
 from weldcal.calibration.data.scanner_correction import DEVICE
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array
-from weldcal.tools.report.calibration import pose_records, scanner_pose, tilt_summary
+from weldcal.tools.report.calibration import scanner_pose
 from weldcal.tools.report.first_screen import (
     NO_TOLERANCE,
     Findings,
@@ -26,7 +36,7 @@ from weldcal.tools.report.first_screen import (
     typed,
 )
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
-from weldcal.tools.report.render import fixed, known, render, sigma_rows, statistics
+from weldcal.tools.report.render import fixed, render, sigma_rows
 
 
 def motion_result(

@@ -7,9 +7,8 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
@@ -17,12 +16,19 @@ from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic as write_atomic
 from weldcal.tools.console import plain
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
 
 _OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*)")
+
+
+def check_folder(out: Path, what: str = "result") -> None:
+    """Check that a folder can be written. Raises InputError where a file has its name."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file. Give a folder for the {what}.")
 
 
 def render(template: str, **context: object) -> str:
@@ -79,26 +85,6 @@ def fixed(value: float | None, digits: int = 2) -> str:
 def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     """Numbers as ``fixed`` writes them, in one row."""
     return "  ".join(fixed(float(value), digits) for value in values)
-
-
-def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Compute median, mean, rms, p95, min, max by name (median, mean, p95, max without); NaN for no finite value."""
-    v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
-    of: dict[str, Callable[[Array], Any]] = {
-        "median": np.median,
-        "mean": np.mean,
-        "rms": lambda x: np.sqrt(np.mean(x**2)),
-        "p95": lambda x: np.percentile(x, 95),
-        "min": np.min,
-        "max": np.max,
-    }
-    chosen = names or ("median", "mean", "p95", "max")
-    return {name: float(of[name](v)) if len(v) else float("nan") for name in chosen}
-
-
-def known(value: float) -> float | None:
-    """Return the number for a JSON object; None where it is not finite."""
-    return float(value) if math.isfinite(value) else None
 
 
 def sigma_rows(covariance: Array) -> list[tuple[str, str]]:

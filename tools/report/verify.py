@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.validation import Offset
-from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, known, statistics
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
+from weldcal.calibration.verified_scans import FEW, WORST_TILT_DEG, VerifiedScans
 from weldcal.tools.report.calibration import fit_cells, interval_rows, scanner_pose
 from weldcal.tools.report.first_screen import (
     CARE,
@@ -29,23 +26,11 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars, error_field
-from weldcal.tools.report.render import fixed, known, statistics
-
-
-@dataclass(frozen=True)
-class PoseError:
-    """One scan: distance (mm) of the flange centres by calibration and robot, and angle (deg) of the normals.
-
-    The angle is None where no normal was seen; also whether the calibration used this scan.
-    """
-
-    id: str
-    error_mm: float
-    tilt_deg: float | None
-    used_before: bool
-
+from weldcal.tools.report.render import fixed
 
 NONE = "not a verification"
+CORRECTED = "corrected"
+"""The folder of the shifted calibration in that of a verification."""
 ANY_LIMIT_MM = 0.5  # a choice: that of docs/first_hour/your_scans.md
 
 
@@ -67,30 +52,47 @@ class Verdict:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyReport:
-    """The result of a verification. ``observations`` include the scanner correction where the result has one.
+class VerifyReport(VerifiedScans):
+    """The result of a verification, its folder and its sources; ``pose`` is what the option of this name must state."""
 
-    ``offset``: how far X_BC is off by the new scans alone; None where they are too few. ``flange`` and ``pose`` are
-    what the options of the same names must state for these files; ``notes`` say how they were read.
-    """
-
-    result: CalibrationResult
-    correction: ScannerCorrection | None
-    observations: tuple[Observation, ...]
-    fits: dict[str, FlangeFit]
-    poses: tuple[PoseError, ...]
-    refused: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-    hashes: dict[str, str]
     out: Path
-    verdict: Verdict
-    source: str = ""
     dataset: str = "NEW_SCANS"
     calibration: str = RESULT_FILE
-    notes: tuple[str, ...] = ()
-    offset: Offset | None = None
-    flange: str = ""
     pose: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the new scans alone; a calibration of another arm is named first."""
+        found = self._verdict()
+        named = not self.other_arm or self.other_arm in found.reason
+        return found if named else replace(found, reason=f"{self.other_arm} {found.reason}")
+
+    def _verdict(self) -> Verdict:
+        new, limit_mm, source = [p for p in self.poses if not p.used_before], self.limit_mm, self.source
+        if not new:
+            return Verdict(NONE, None, "The calibration used all of these scans. Take new scans to verify it.")
+        median = float(np.median([p.error_mm for p in new]))
+        scans = f"{len(new)} new scan{'' if len(new) == 1 else 's'}"
+        said = f"The median error on {scans} is {median:.3f} mm"
+        tilts = [p.tilt_deg for p in new if p.tilt_deg is not None]
+        if tilts and float(np.median(tilts)) > WORST_TILT_DEG:
+            return Verdict(
+                DO_NOT, limit_mm, f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the poses."
+            )
+        if limit_mm is None:
+            return Verdict(
+                CARE, None, f"{said}, and the calibration states no error of its own. Give a limit: --limit-mm."
+            )
+        if median > limit_mm:
+            return Verdict(
+                DO_NOT, limit_mm, f"{said}, above the limit of {limit_mm:.3f} mm, {source}. Calibrate again."
+            )
+        said += f", within the limit of {limit_mm:.3f} mm, {source}"
+        if len(new) < FEW:
+            return Verdict(CARE, limit_mm, f"{said}; fewer than {FEW} new scans say little.")
+        if self.doubts:
+            return Verdict(CARE, limit_mm, f"{said}. But: {self.doubts[0]}")
+        return Verdict(USE, limit_mm, f"{said}.")
 
     @property
     def first(self) -> FirstScreen:
@@ -132,10 +134,14 @@ class VerifyReport:
                 f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
                 " from the new solution. The vector is in the base, at the middle of these scans."
             )
+        if self.shift:
+            more["corrected"] = self.shift
         return FirstScreen(found, expected, self._next(), tuple(poses), more)
 
     def _next(self) -> Next:
         v, flange = self.verdict, ("--flange", self.flange) if self.flange else ()
+        if self.corrected is not None:
+            return Next(f"Verify the pose in {self.out / CORRECTED} on other scans before you use it.")
         held = None if self.offset is None else 1e3 * float(np.nanmedian(self.offset.new.held_out.position_m))
         if v.verdict == USE:
             return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
@@ -182,6 +188,7 @@ class VerifyReport:
             "warnings": list(self.warnings),
             "notes": list(self.notes),
             "X": self.result.X_BC.GetAsMatrix4().tolist(),
+            "X_corrected": None if self.corrected is None else self.corrected.X_BC.GetAsMatrix4().tolist(),
             **self._off(),
         }
 

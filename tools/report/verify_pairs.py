@@ -1,13 +1,13 @@
 """Write the page of `verify` on pairs: the rule of the verdict, residuals and held-out errors of every pair."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.calibration.data.results import known
 from weldcal.calibration.geometry.se3 import as_transform
-from weldcal.calibration.hand_eye.mountings import Mounting
-from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
+from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL
+from weldcal.calibration.verified_pairs import VerifiedPairs
 from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
@@ -22,41 +22,25 @@ from weldcal.tools.report.first_screen import (
 )
 from weldcal.tools.report.page import Bullets, Quantity, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, known
+from weldcal.tools.report.render import fixed
 from weldcal.tools.report.verify import NONE, Verdict
 
 CANNOT_TELL = "cannot tell"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsReport:
-    """A stated pose judged on pairs.
+class PairsReport(VerifiedPairs):
+    """A stated pose judged on pairs, for a page.
 
     Attributes:
-        judgement: the figures.
-        mounting: that of the pairs.
-        result, pairs: names of the two sources.
-        read_as: how the pose was read, a phrase.
-        ids: names of the pairs (n).
-        same_data: whether the result was computed from these pairs.
+        pairs: name of their file or folder.
         limit_mm: the error that the job allows, or None.
-        reading, notes: how the pairs were understood.
-        mounting_stated: the mounting that the result names, or None.
         board: the board, where the pairs are pictures of it.
         options: further words of a command that reads the pairs.
     """
 
-    judgement: Judgement
-    mounting: Mounting
-    result: str
     pairs: str
-    read_as: str
-    ids: tuple[str, ...]
-    same_data: bool = False
     limit_mm: float | None = None
-    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    mounting_stated: str | None = None
     board: str = ""
     options: tuple[str, ...] = ()
 

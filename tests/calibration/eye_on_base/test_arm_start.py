@@ -25,7 +25,7 @@ from weldcal.calibration.eye_on_base.arm_start import (
 )
 from weldcal.models.arms.chain import chain_forward, known_chains, load_chain
 from weldcal.models.flanges import get_flange
-from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.recorded import calibrate_dataset
 
 FAR = 13  # a Franka at 1.4 m that shows its flange in three of eight scans; none is found without help
 

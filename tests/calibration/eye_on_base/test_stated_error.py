@@ -23,10 +23,11 @@ from weldcal.calibration.eye_on_base.stated_error import (
     stated_median_limit,
 )
 from weldcal.calibration.eye_on_base.validation import position_errors
+from weldcal.calibration.verified_scans import VerifyOptions
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.report.first_screen import pose_rows
+from weldcal.tools.verified import verify_dataset
 
 SIGMA = 2e-4
 
@@ -225,4 +226,4 @@ def test_the_terminal_prints_the_verdict_and_the_pose(tmp_path: Path) -> None:
 @pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
 def test_a_limit_that_is_none_is_refused(tmp_path: Path, limit: float) -> None:
     with pytest.raises(InputError, match="limit must be a positive number"):
-        verify_dataset(tmp_path, tmp_path, tmp_path / "out", limit_mm=limit)
+        verify_dataset(tmp_path, tmp_path, tmp_path / "out", VerifyOptions(limit_mm=limit))

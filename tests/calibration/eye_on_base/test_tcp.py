@@ -17,7 +17,7 @@ from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.tcp import FALSE_ALARM, find_tcp
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.recorded import calibrate_dataset
 
 
 def with_tcp(observations: list[Observation], tcp_m: list[float]) -> list[Observation]:

@@ -22,7 +22,7 @@ from weldcal.calibration.published.algorithm1 import (
     translation_cost,
 )
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.algorithm1_comparison import algorithm1_curve, run_algorithm1
+from weldcal.tools.algorithm1_comparison import algorithm1_curve, run_algorithm1
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 

@@ -19,6 +19,7 @@ from tests.worlds.wrong_models import (
     study_station,
 )
 from weldcal.calibration.calibrate import PLAIN, Steps, calibrate
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, corrected_observation, with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
@@ -28,7 +29,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.report.pictures import subplots, svg
-from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.report.render import fixed
 
 LEVEL = 0.95
 _ARM_M = 1.5e-4  # per axis, what recorded arms leave of a calibration

@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from tests.figures.harness import Run, figure
 from tests.places import SHARED_DATA
 from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import corrected_observation
@@ -24,7 +25,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.report.render import fixed
 
 SIZES = (1, 2, 3, 4, 6, 8, 12)
 KEPT = 4  # scans that at least are left to judge by

@@ -7,11 +7,12 @@ import numpy as np
 
 from tests.figures.harness import Run, figure
 from tests.worlds.flange_frames import WAYS, empty_frame, fit_frame, flange_frame, hidden_frame
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.report.render import fixed
 
 FLANGE = "iso9409-1-50-4-m6"
 

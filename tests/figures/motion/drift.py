@@ -6,9 +6,10 @@ import numpy as np
 
 from tests.figures.harness import Run, figure
 from tests.worlds.moves import Change, WorldConfig, simulate
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
-from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.report.render import fixed
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0

@@ -370,11 +370,11 @@ def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[tuple[str, Row, list[Row]]
         for method in papers.EDGE_METHODS:
             found = [by[name, method, k] for k in n]
             alpha = (pair(r.alpha_mean_deg, r.alpha_std_deg, 2) for r in found)
-            lines = tuple(pair(r.group_mean_deg, r.group_std_deg, 2) for r in found)
+            of_groups = tuple(pair(r.group_mean_deg, r.group_std_deg, 2) for r in found)
             d = (pair(r.d_mean_mm, r.d_std_mm, 3) for r in found)
             for table, cells in zip(tables, (alpha, d, (fixed(r.radius_mm, 3) for r in found)), strict=True):
                 table.append((papers.TITLES[name], method, *cells))
-            tables[0].append((f"{papers.TITLES[name]}, a line for each rotation", method, *lines))
+            tables[0].append((f"{papers.TITLES[name]}, a line for each rotation", method, *of_groups))
         for k in n:
             p, q = (by[name, m, k] for m in papers.EDGE_METHODS)
             three = ((p.rotation_deg, p.translation_mm), (q.rotation_deg, q.translation_mm), (q.crb_deg, q.crb_mm))

@@ -6,9 +6,9 @@ from tests.figures.harness import Missed, Run, figure
 from tests.worlds.robot.bench import Bench
 from tests.worlds.robot.cases import AT_START, RUNNING
 from tests.worlds.robot.fault_run import FaultOutcome, FaultSequence, run_case, run_sequence
+from weldcal.calibration.data.results import statistics
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.tools.emulators.ur.process import emulator_process
-from weldcal.tools.report.render import statistics
 
 
 def wrong_ones(outcomes: Sequence[FaultOutcome], sequences: Sequence[FaultSequence]) -> dict[str, str]:

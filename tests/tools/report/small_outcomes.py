@@ -14,8 +14,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
 from tests.worlds.light_runs import mounted_world
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, statistics
 from weldcal.calibration.data.scanner_correction import ScannerClock
+from weldcal.calibration.eye_on_base.observations import FlangeObservations
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import Convergence
 from weldcal.calibration.hand_eye.mountings import get_mounting
@@ -27,22 +28,22 @@ from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
+from weldcal.calibration.verified_scans import PoseError
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
-from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
+from weldcal.tools.report.first_screen import NO_TOLERANCE, FirstScreen
 from weldcal.tools.report.hand_eye import HandEyeReport, hand_eye_report
 from weldcal.tools.report.monitor import MonitorReport, monitor_page
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.mounting import MountingReport, mounting_report
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
-from weldcal.tools.report.render import statistics
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
-from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
+from weldcal.tools.report.verify import VerifyReport, verify_report
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")
@@ -79,7 +80,7 @@ def calibration(**changes: Any) -> CalibrationReport:
         estimate=ESTIMATE,
         observations=tuple(OBSERVATIONS),
         scanner=None,
-        fits={},
+        seen=FlangeObservations(tuple(OBSERVATIONS), {}, {}, {}, ()),
         refused=(("p99", "No flange was found."),),
         outliers=(),
         algorithm1=None,
@@ -102,7 +103,6 @@ def calibrate() -> Made:
 def verify() -> Made:
     """`verify` on scans of which some were used before."""
     poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
-    verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
     report = VerifyReport(
         result=RESULT,
         correction=None,
@@ -113,8 +113,9 @@ def verify() -> Made:
         warnings=("Take new scans.",),
         hashes={},
         out=OUT,
-        verdict=verdict,
+        limit_mm=0.4,
         source="given",
+        doubts=("Something.",),
     )
     return report.first, verify_report(report, dataset="others")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
+from weldcal.calibration.data.results import software_version, statistics
 from weldcal.calibration.tablet.planar_files import PlanarFile, PlanarVisit
 from weldcal.calibration.tablet.planar_fit import (
     LINEAR_NAMES,
@@ -26,7 +26,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, mappings_csv, render, statistics, write_atomic
+from weldcal.tools.report.render import fixed, mappings_csv, render, write_atomic
 from weldcal.tools.report.tablet import Page, visits_screen
 
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"

@@ -15,6 +15,7 @@ from tests.figures.flange.published.simulation import ORDERS, simulate
 from tests.figures.harness import Run, figure
 from tests.worlds.flange_frames import P_FS, SphereScan, cell_scans
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.results import statistics
 from weldcal.calibration.eye_on_base.estimate import corrected_observation
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -25,7 +26,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.report.render import statistics
 
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}
 """The paper's Table 2 by its number of pairs: x, y, z in mm, roll, pitch, yaw in degrees."""
@@ -216,8 +216,8 @@ def flange(run: Run) -> None:
     for name, ratio in (("Algorithm 1", sim.ratio), (f"the best of {ORDERS} orders by the truth", sim.chosen_ratio)):
         run.say(f"Fig. 9: spread of all pairs over that of {name}, roll pitch yaw x y z: {numbers(ratio)}")
     run.say("The paper's 7 in x and y needs both: the truth as the cost, and the best of several orders.\n")
-    rows = [(name, *(f"{1e3 * v:.2f}" for v in (e.at_tcp.mean(), e.at_tcp.max()))) for name, e in sim.scaled.items()]
-    run.table("Eq. 10 and 11 (simulated, 1 mm of noise)", ("calibration", "true mm", "worst mm"), rows)
+    scaled = [(name, *(f"{1e3 * v:.2f}" for v in (e.at_tcp.mean(), e.at_tcp.max()))) for name, e in sim.scaled.items()]
+    run.table("Eq. 10 and 11 (simulated, 1 mm of noise)", ("calibration", "true mm", "worst mm"), scaled)
     for title, header, rows in tables(found):
         run.table(title, header, rows)
     for name, draw in pictures(found).items():

@@ -14,9 +14,10 @@ from tests.figures.flange.published.clouds import METHODS, CloudsOutcome
 from tests.figures.flange.published.pairs import KinectOutcome, PairsOutcome
 from tests.figures.flange.published.simulation import COSTS, Simulation
 from tests.figures.harness import Row
+from weldcal.calibration.data.results import statistics
 from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, subplots, svg
-from weldcal.tools.report.render import fixed, statistics
+from weldcal.tools.report.render import fixed
 
 TABLE1: dict[str, tuple[float, ...]] = {
     "UR5 & PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.results import IcpRecord
-from weldcal.calibration.eye_on_base.observations import FlangeObservations
+from weldcal.calibration.data.results import IcpRecord, statistics
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, shuffled_orders
 from weldcal.calibration.flange.observation import Observation
@@ -24,10 +23,10 @@ from weldcal.calibration.published.algorithm1 import (
     sight,
     translation_cost,
 )
+from weldcal.calibration.recorded_flange import RecordedFlange
 from weldcal.models.arrays import Array
-from weldcal.models.flanges import FlangeStandard
+from weldcal.models.flanges import get_flange
 from weldcal.tools.report.calibration import Algorithm1Outcome
-from weldcal.tools.report.render import statistics
 
 FEWEST = 6
 """Inliers below which Algorithm 1 is not compared."""
@@ -94,10 +93,9 @@ def algorithm1_curve(
     return figure, true
 
 
-def compare_algorithm1(
-    seen: FlangeObservations, inliers: list[Observation], counts: Array, standard: FlangeStandard, seed: int
-) -> tuple[Algorithm1Outcome | None, tuple[IcpRecord, ...]]:
+def compare_algorithm1(found: RecordedFlange) -> tuple[Algorithm1Outcome | None, tuple[IcpRecord, ...]]:
     """Run Algorithm 1 with the pose nearest the middle held out for verification; None for fewer than six inliers."""
+    seen, inliers, seed = found.seen, found.inliers, found.result.seed
     if len(inliers) < FEWEST:
         return None, ()
     middle = np.median([o.p_BR for o in inliers], axis=0)
@@ -109,6 +107,7 @@ def compare_algorithm1(
     shares: Sight | None = None
     verifier: Verifier
     if seen.clouds:
+        standard = get_flange(found.result.flange)
         as_published = make_verification(seen.clouds[held.id], held.X_BR, standard, max_points=1500, seed=seed)
         verifier = as_published
         metric = "point-to-point ICP of the verification cloud against the flange's model"
@@ -132,7 +131,7 @@ def compare_algorithm1(
         at_verification_mm=1e3 * float(position_errors(run.X_BC, [held])[0]),
         unseen=unseen,
         shares=tuple(float(s) for s in shares.share) if shares is not None else (),
-        curve=algorithm1_curve(inliers, verifier, counts, seed=seed),
+        curve=algorithm1_curve(inliers, verifier, found.convergence.counts, seed=seed),
     )
     return outcome, tuple(icp)
 

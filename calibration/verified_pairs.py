@@ -1,17 +1,16 @@
 """Judge any file with a camera's pose on pairs of robot and camera poses, or on pictures of a board."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from weldcal.calibration.data.clouds import NO_NOTES
 from weldcal.calibration.data.poses.bag import find_bag
 from weldcal.calibration.data.poses.source import FOLDERS
 from weldcal.calibration.data.stated_pose import StatedPose, read_stated_pose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.mountings import get_mounting
+from weldcal.calibration.hand_eye.exports import digest
+from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pairs.judging import Judgement, judge_pose
@@ -20,11 +19,6 @@ from weldcal.calibration.hand_eye.pictures.sets import read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.recorded_hand_eye import problem_of_pairs
-from weldcal.models.errors import InputError
-from weldcal.models.files import write_atomic
-from weldcal.tools.commands.hand_eye import digest
-from weldcal.tools.console import plain
-from weldcal.tools.report.verify_pairs import PairsReport, verify_pairs_report
 
 _MOUNTINGS = ("eye_in_hand", "eye_on_base")
 
@@ -50,97 +44,111 @@ def holds_scans(path: Path) -> bool:
     )
 
 
-def verify_on_pairs(
-    result: Path,
-    pairs: Path,
-    out: Path | None,
-    *,
-    mounting: str | None = None,
-    unit: str | None = None,
-    stated: StatedForms | None = None,
-    pose: str | None = None,
-    limit_mm: float | None = None,
-    board: str | None = None,
-    intrinsics: Path | None = None,
-    seed: int = 0,
-    options: tuple[str, ...] = (),
-) -> PairsReport:
-    """Judge the pose in a file on pairs; write verification.json and report.html to ``out`` (None: nothing is written).
+@dataclass(frozen=True, kw_only=True)
+class PairsOptions:
+    """How a stated pose and the pairs are to be read.
+
+    Attributes:
+        mounting: eye_in_hand or eye_on_base; else as the pairs or the result state it, or as the result fits.
+        unit, stated: how the pairs are written, as with `hand-eye`.
+        pose: key of the pose, where the result's file holds several.
+        board, intrinsics: the board in the pictures of the folder of pairs, and the file of their camera.
+    """
+
+    mounting: str | None = None
+    unit: str | None = None
+    stated: StatedForms = field(default_factory=StatedForms)
+    pose: str | None = None
+    board: str | None = None
+    intrinsics: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifiedPairs:
+    """A stated pose judged on pairs.
+
+    Attributes:
+        judgement: the figures.
+        mounting: that of the pairs.
+        result: name of the file with the pose.
+        read_as: how the pose was read, a phrase.
+        ids: names of the pairs (n).
+        same_data: whether the result was computed from these pairs.
+        reading, notes: how the pairs were understood.
+        mounting_stated: the mounting that the result names, or None.
+    """
+
+    judgement: Judgement
+    mounting: Mounting
+    result: str
+    read_as: str
+    ids: tuple[str, ...]
+    same_data: bool = False
+    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    mounting_stated: str | None = None
+
+
+def verify_pairs(result: Path, pairs: Path, asked: PairsOptions | None = None) -> VerifiedPairs:
+    """Judge the pose in a file on pairs.
 
     Args:
         result: any file with a pose: docs/hand_eye.md lists the forms.
         pairs: a file or folder that `weldcal hand-eye` reads.
-        mounting: eye_in_hand or eye_on_base; else as the pairs or the result state it, or as the result fits.
-        unit, stated: how the pairs are written, as with `hand-eye`.
-        pose: key of the pose, where the result's file holds several.
-        limit_mm: error at the target that the job allows.
-        options: further words with which a command reads the pairs, for the next step.
-        board, intrinsics: the board in the pictures of the folder ``pairs``, and the file of their camera.
 
     Raises:
         InputError: a file cannot be read; InconsistentPoses: the pairs contradict each other.
     """
-    if limit_mm is not None and not (np.isfinite(limit_mm) and limit_mm > 0.0):
-        raise InputError(f"The limit must be a positive number of millimetres, not {limit_mm:g}.")
-    given = read_stated_pose(Path(result), pose)
-    config = HandEyeConfig(seed=seed)
-    forms = stated or StatedForms()
-
-    def read_in(mode: str | None) -> tuple[PosePairs, HandEyeResult | None]:
-        if board is None:
-            return read_pairs(Path(pairs), mounting=mode, length=unit, stated=forms), None
-        what = parse_board(board)
-        shots = read_pictures(Path(pairs), what, mounting=mode, unit=unit, stated=forms, camera=intrinsics)
-        # an estimated camera moves all pictures alike: only the adjustment of the corners knows by how much
-        new, found, _ = solve_pictures(shots, lambda found: solve_problem(problem_of_pairs(found), config=config))
-        return found, new
-
-    read, reading, found = _judged(given, Path(pairs), mounting, read_in, config)
+    asked = asked or PairsOptions()
+    given = read_stated_pose(result, asked.pose)
+    read, reading, found = _judged(given, pairs, asked)
     one = given.readings[reading]
     words = f"{given.form}, {one.words}" if len(given.readings) > 1 else given.form
     words += f" in {given.unit}"
     if reading:
         words += " (of all readings the one that fits best)"
-    n = len(read.robot)
-    report = PairsReport(
+    return VerifiedPairs(
         judgement=found,
         mounting=get_mounting(read.mode),
         result=given.name,
-        pairs=str(pairs),
         read_as=words,
-        ids=read.ids or tuple(str(k + 1) for k in range(n)),
-        same_data=digest(Path(pairs)) in given.data,
-        limit_mm=limit_mm,
+        ids=read.ids or tuple(str(k + 1) for k in range(len(read.robot))),
+        same_data=digest(pairs) in given.data,
         reading=read.reading,
         notes=read.notes,
         mounting_stated=given.mounting,
-        board=board or "",
-        options=options,
     )
-    if out is not None:
-        write_atomic(out / "report.html", verify_pairs_report(report))
-        # last, so that its presence means that everything else is there
-        write_atomic(out / "verification.json", json.dumps(plain(report.summary()), indent=2, allow_nan=False) + "\n")
-    return report
 
 
-def _judged(
-    given: StatedPose,
-    path: Path,
-    mounting: str | None,
-    read_in: Callable[[str | None], tuple[PosePairs, HandEyeResult | None]],
-    config: HandEyeConfig,
-) -> tuple[PosePairs, int, Judgement]:
+def _read(path: Path, mode: str | None, asked: PairsOptions) -> tuple[PosePairs, HandEyeResult | None]:
+    """Return the pairs in a mounting; of pictures with their own solution."""
+    if asked.board is None:
+        return read_pairs(path, mounting=mode, length=asked.unit, stated=asked.stated), None
+    what, config = parse_board(asked.board), HandEyeConfig(seed=asked.seed)
+    shots = read_pictures(path, what, mounting=mode, unit=asked.unit, stated=asked.stated, camera=asked.intrinsics)
+    # an estimated camera moves all pictures alike: only the adjustment of the corners knows by how much
+    new, found, _ = solve_pictures(shots, lambda found: solve_problem(problem_of_pairs(found), config=config))
+    return found, new
+
+
+def _judged(given: StatedPose, path: Path, asked: PairsOptions) -> tuple[PosePairs, int, Judgement]:
     """Judge the pose on the pairs, in the stated mounting or else in the one in which it fits."""
 
+    mounting = asked.mounting
+
     def judged(mode: str | None) -> tuple[PosePairs, int, Judgement]:
-        pairs, new = read_in(mode)
+        pairs, new = _read(path, mode, asked)
         if pairs.mode not in _MOUNTINGS:
             raise DatasetError(
                 f"'{path.name}' is {pairs.mode}; verify judges the mountings {' and '.join(_MOUNTINGS)}."
             )
         reading, found = judge_pose(
-            problem_of_pairs(pairs), [one.X for one in given.readings], given.covariance, config, new
+            problem_of_pairs(pairs),
+            [one.X for one in given.readings],
+            given.covariance,
+            HandEyeConfig(seed=asked.seed),
+            new,
         )
         return pairs, reading, found
 
