@@ -35,6 +35,7 @@ CHEAP = (
     *(
         "tablet calibrate",
         "profiler seam",
+        "profiler bead",
         "profiler compensate",
         "hand-eye ax-xb",
         "hand-eye ax-yb",

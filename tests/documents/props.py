@@ -179,6 +179,13 @@ def _profiler(name: str) -> Callable[[Path], None]:
     return write
 
 
+def _bead(path: Path) -> None:
+    from tests.worlds.bead import seam
+
+    made = seam(12, np.random.default_rng(0))
+    np.savez(path, T=made.X_BS, profiles=np.array(made.profiles), unit="m")
+
+
 def _profiler_result(path: Path) -> None:
     from weldcal.tools.cli.app import app
 
@@ -233,6 +240,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "edge.npz": _profiler("edge"),
     "sphere.npz": _profiler("sphere"),
     "groove.npz": _profiler("groove"),
+    "bead.npz": _bead,
     "my-profiler": _profiler_result,
 }
 # They are taken from measured and fixed data beside the checkout.

@@ -37,6 +37,7 @@ OTHERS = {
     ),
     "profiler edge": "profiler edge edge.npz",
     "profiler seam": "profiler seam groove.npz --calibration my-profiler",
+    "profiler bead": "profiler bead bead.npz --calibration my-profiler",
 }
 
 

@@ -1,4 +1,4 @@
-"""The results of `weldcal profiler edge`, `sphere`, `compensate` and `seam`, with their first screens and pages."""
+"""The results of `weldcal profiler` from files: calibrations, seams and beads, with first screens and pages."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.profiler.features.bead_course import BeadCourse
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.arrays import Array
 from weldcal.tools.report.first_screen import (
@@ -30,7 +31,9 @@ _NAMES = {
     "scans": ("scans", ""),
     "touches": ("touches", ""),
     "inliers": ("points used", ""),
-    "found": ("profiles with a groove", ""),
+    "found": ("profiles that show it", ""),
+    "length_mm": ("length", "mm"),
+    "volume_mm3": ("volume", "mm3"),
     "model": ("model", ""),
     "model_reason": ("why this model", ""),
     "method": ("method", ""),
@@ -53,10 +56,17 @@ _LOST = {
     "without_feature": "{n} of {all} profiles show no edge and were not used.",
     "without_sphere": "{n} of {all} profiles show no sphere and were not used.",
     "without_groove": "{n} of {all} profiles show no groove.",
+    "without_bead": "{n} of {all} profiles show no bead: a gap, or bad returns.",
     "outlier_scans": "{n} of {all} points lie off the edge and were not used.",
     "wrong_scans": "{n} of {all} scans lie off the sphere and were not used.",
 }
-_GRAVE = {"wrong_sides": "The side of the sphere's centre is likely wrong in {n} of {all} scans: check their sign."}
+_GRAVE = {
+    "wrong_sides": "The side of the sphere's centre is likely wrong in {n} of {all} scans: check their sign.",
+    "unlike_profiles": "{n} of {all} profiles are unlike their neighbours: look for a gap, a bulge or spatter there.",
+}
+NUMBERS = (*_LOST, *_GRAVE)
+"""Keys of the JSON object that hold numbers of scans or profiles."""
+_UNPOSED = "No --calibration: the values are by profile number, not turned across the seam, without volume."
 
 
 def pose_of(record: ProfilerRecord) -> RigidTransform:
@@ -167,6 +177,58 @@ class ProfilerSeam:
             (pose,),
             {"seam": f"{n} of {self.found['scans']} profiles show it; seam.csv holds it in the base"},
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ProfilerBead:
+    """A bead along its seam: ``found`` are values of the JSON object, ``record`` None where no pose is known."""
+
+    record: ProfilerRecord | None
+    found: Mapping[str, Any]
+    course: BeadCourse
+    source: str
+    out: Path
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: the error of a width is the larger of that by its sigma and that against neighbours."""
+        own, held = 2.0 * self.found["width_mm"]["sigma"], np.abs(1e3 * self.course.left_out[:, 0])
+        p95 = float(np.percentile(held, 95)) if np.isfinite(held).all() else float("nan")
+        fit = f"samples: {own:.3f} mm, neighbours of {len(held)} profiles: {p95:.3f} mm".replace("nan mm", "not known")
+        what, error = "error of a width, 95 %", float(np.fmax(own, p95))
+        tolerance = limit_tolerance(what, error, self.limit_mm)
+        grave, notes = scan_notes(self.found)
+        alone = () if self.record else (_UNPOSED,)
+        found = Findings(tolerance=tolerance, concerns=(*self.found.get("warnings", ()), *alone, *grave), notes=notes)
+        step = Next("Compare some widths and heights of bead.csv with a gauge or a cut.", uses=True)
+        at, rows = "station" if self.record else "profile", {}
+        for key, (unit, _) in BEAD.items():
+            of = self.found[key]
+            ends = [f"{of[end]:.2f} {unit} at {at} {of[f'{end}_at']:.1f}" for end in ("smallest", "largest")]
+            spread = f"one sigma {of['sigma']:.3f}, left out {of['left_out_rms']:.3f}".replace("nan", "not known")
+            rows[key.partition("_")[0]] = f"{of['mean']:.2f} {unit}, from {' to '.join(ends)}; {spread}"
+        return FirstScreen(found, ExpectedError(what, f"{error:.3f} mm", fit), step, more=rows)
+
+    @property
+    def page(self) -> str:
+        """The page, as one self-contained HTML text."""
+        figure, three = subplots(8.2, 6.0, 3, 1, sharex=True)
+        at, odd = self.course.station * (1e3 if self.record else 1.0), self.course.unlike
+        for k, (axes, (key, (unit, scale))) in enumerate(zip(three, BEAD.items(), strict=True)):
+            value, sigma = scale * self.course.values[:, k], scale * self.course.sigmas[:, k]
+            axes.errorbar(at, value, 3.0 * sigma, fmt=".", color=OURS, markersize=3, elinewidth=0.7)
+            axes.plot(at[odd], value[odd], "o", color="#777777", markersize=9, fillstyle="none")
+            axes.set(ylabel=f"{key.partition('_')[0]}, {unit}", xlabel="station, mm" if self.record else "profile")
+        shot = Shot(svg(figure, *three), RINGS, "Width, height and area of the bead along its seam")
+        sections = _sections(self.found, [("Along the seam", [shot, FactList(list(self.first.more.items()))])], [])
+        return page_html(f"Bead measured from {self.source}", ALONG, sections, first=self.first)
+
+
+BEAD = {"width_mm": ("mm", 1e3), "height_mm": ("mm", 1e3), "area_mm2": ("mm2", 1e6)}
+"""What is measured of a bead, by its key in the JSON object: its unit and what turns m or m2 into it."""
+ALONG = "Width from toe to toe, height over the plates, area between the toes."
+RINGS = "Each profile, with three sigma. Grey rings mark profiles that are unlike their neighbours."
 
 
 def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:

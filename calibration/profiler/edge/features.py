@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.models.errors import InputError
+from weldcal.calibration.profiler.returns import returns_of
 
 MEDIAN = 5  # samples: takes out single spikes
 RUN_M = 6e-3  # of the face beside an edge that is looked at
@@ -34,16 +34,10 @@ def extract_edge(profile: ArrayLike, kind: Kind, side: Literal["left", "right"] 
     Raises:
         FeatureNotFound: the profile does not show it. InputError: not a profile.
     """
-    p = np.asarray(profile, float)
-    if p.ndim != 2 or p.shape[1] != 2:
-        raise InputError(f"A profile is an array (n, 2) of [x, z], not {p.shape}.")
-    p = p[np.isfinite(p).all(axis=1)]
+    p = returns_of(profile, 2 * MINIMUM_RUN, "object")
     if side == "right":
         point, sigma = extract_edge(p * [-1.0, 1.0], kind, "left")
         return point * [-1.0, 1.0], sigma
-    p = p[np.argsort(p[:, 0], kind="stable")]
-    if len(p) < 2 * MINIMUM_RUN:
-        raise FeatureNotFound(f"The profile has {len(p)} returns only: bring the object into the scanner's range.")
     pitch = float(np.median(np.diff(p[:, 0])))
     return _apex(p, pitch) if kind == "apex" else _end(p, pitch, MINIMUM_JUMP_M[kind])
 

@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.models.errors import InputError
+from weldcal.calibration.profiler.returns import returns_of
 
 MEDIAN = 9  # samples: takes out spikes for the start only
 OUTER = 0.12  # of the samples at each end lie on the plate
@@ -46,15 +46,7 @@ def groove_features(profile: ArrayLike) -> GrooveFeatures:
 
     Source: sphere and touch paper, section 3.2 (its feature points 1 to 3).
     """
-    p = np.asarray(profile, float)
-    if p.ndim != 2 or p.shape[1] != 2:
-        raise InputError(f"A profile is an array (n, 2) of [x, z], not {p.shape}.")
-    p = p[np.isfinite(p).all(axis=1)]
-    p = p[np.argsort(p[:, 0], kind="stable")]
-    n = len(p)
-    if n < 8 * MINIMUM_SAMPLES:
-        raise FeatureNotFound(f"The profile has {n} returns only: bring the groove into the scanner's range.")
-    x, z = p.T
+    x, z = returns_of(profile, 8 * MINIMUM_SAMPLES, "groove").T
     knots = _start(x, median_filter(z, MEDIAN, mode="nearest"))
     for _ in range(ROUNDS):
         parts = _parts(x, knots)
@@ -167,30 +159,14 @@ def _line(x: Floats, z: Floats) -> _Line:
         C = np.asarray(np.linalg.inv(powers[:, :k].T @ powers[:, :k]) * spread, float)
         change = np.linalg.lstsq(powers[:, :k], rest, rcond=None)[0]
         bend = float(change[-1] ** 2)
-        if k > 2 and bend > BENT**2 * C[-1, -1]:
-            coefficients = straight[:k] + change
-            return _Line(
-                x0=x0,
-                reach=reach,
-                coefficients=coefficients,
-                covariance=C,
-                unseen=np.array(unseen),
-                left=np.array(left).reshape(-1, 4),
-                sigma=sigma,
-            )
-        if k > 2:
-            unseen.append(max(bend - float(C[-1, -1]), 0.0))
-            lower = np.linalg.lstsq(powers[:, : k - 1], powers[:, k - 1], rcond=None)[0]
-            left.append(np.concatenate([-lower, [1.0], np.zeros(4 - k)]))
-    return _Line(
-        x0=x0,
-        reach=reach,
-        coefficients=straight[:2],
-        covariance=C,
-        unseen=np.array(unseen),
-        left=np.array(left),
-        sigma=sigma,
-    )
+        if k == 2 or bend > BENT**2 * C[-1, -1]:
+            break
+        unseen.append(max(bend - float(C[-1, -1]), 0.0))
+        lower = np.linalg.lstsq(powers[:, : k - 1], powers[:, k - 1], rcond=None)[0]
+        left.append(np.concatenate([-lower, [1.0], np.zeros(4 - k)]))
+    found = straight[:2] if k == 2 else straight[:k] + change
+    hidden, of = np.array(unseen), np.array(left).reshape(-1, 4)
+    return _Line(x0=x0, reach=reach, coefficients=found, covariance=C, unseen=hidden, left=of, sigma=sigma)
 
 
 def _orthogonal(u: Floats, z: Floats, weight: Floats) -> tuple[float, float]:

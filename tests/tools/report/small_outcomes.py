@@ -25,6 +25,7 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftEvent
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
+from weldcal.calibration.profiler.features.bead_course import bead_course
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
@@ -38,7 +39,14 @@ from weldcal.tools.report.hand_eye import HandEyeReport, hand_eye_report
 from weldcal.tools.report.monitor import MonitorReport, monitor_page
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.mounting import MountingReport, mounting_report
-from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
+from weldcal.tools.report.profiler_file import (
+    BEAD,
+    ProfilerBead,
+    ProfilerFile,
+    ProfilerSeam,
+    profiler_report,
+    seam_report,
+)
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
@@ -361,6 +369,17 @@ def seam() -> Made:
     return made.first, seam_report(made)
 
 
+def bead() -> Made:
+    """`profiler bead`."""
+    values = np.array([0.012, 0.0035, 34e-6]) * np.linspace(1.0, 1.05, 9)[:, None]
+    course = bead_course(values, 0.002 * values, np.arange(9))
+    names = ("mean", "smallest", "smallest_at", "largest", "largest_at", "sigma", "left_out_rms")
+    spread = dict(zip(names, (12.0, 11.8, 3.0, 12.2, 5.0, 0.04, 0.05), strict=True))
+    found = {"scans": 10, "found": 9, "without_bead": [9], **dict.fromkeys(BEAD, spread), "unlike_profiles": [4]}
+    made = ProfilerBead(record=None, found=found, course=course, source="bead.npz", out=OUT)
+    return made.first, made.page
+
+
 def profiler_live() -> Made:
     """`profiler live` of an edge."""
     estimate = SimpleNamespace(rotation=RECORD.rotation, translation=RECORD.translation, covariance=COVARIANCE)
@@ -458,6 +477,7 @@ PAGES: dict[str, Callable[[], Made]] = {
         unbegun,
         profiler,
         seam,
+        bead,
         profiler_live,
         tablet,
         finger,

@@ -49,6 +49,7 @@ JUDGED = (
     "profiler edge edge.npz",
     "profiler sphere sphere.npz --limit-mm 0.01 --out my-profiler",
     "profiler seam groove.npz --calibration my-profiler --limit-mm 0.01",
+    "profiler bead bead.npz --calibration my-profiler --limit-mm 0.01",
     "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --seen seen.csv",
     "tablet calibrate touches.csv --poses poses.csv --camera camera.yaml --seen seen.csv --limit-mm 0.01",
 )

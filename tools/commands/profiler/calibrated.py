@@ -1,17 +1,18 @@
-"""weldcal profiler clock and seam: the offset of a calibrated profiler's clock, and a V-groove mapped into the base.
+"""weldcal profiler clock, seam and bead: the offset of a profiler's clock, a V-groove in the base, a bead's section.
 
 The folder of `profiler clock` holds stream.csv, as a recording in motion, and the profiles: profiles.csv with time,x,z,
 the export of an instrument, or a folder with one file per profile. Of a profile of many points the feature at the side
 is found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.errors import FeatureNotFound
@@ -20,6 +21,8 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, choose_sign, signs_to_try, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.exports import SECONDS, TABLES, TREES, UNITS, Profiles
+from weldcal.calibration.profiler.features.bead import TOE_M, bead_features
+from weldcal.calibration.profiler.features.bead_course import BeadCourse, bead_course, bead_volume
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.importing import profile_unit, profiles_of
 from weldcal.calibration.profiler.motion import FlangePoses
@@ -40,7 +43,7 @@ from weldcal.tools.commands.profiler.result import (
     with_warnings,
 )
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
+from weldcal.tools.report.profiler_file import BEAD, ProfilerBead, ProfilerSeam, middle_error_mm, seam_report
 from weldcal.tools.report.render import csv_text, write_atomic, write_json
 
 _KINDS = ("bar", "step", "apex")
@@ -49,6 +52,8 @@ _ALIKE = 3.0  # standard deviations within which two offsets are one
 _NEAR_S = 0.5  # offset of the clocks that is searched
 # Of the stream that the profiles last at least: seconds that are read as milliseconds last 0.002 of it at most
 _SHARE = 0.01
+_Extract = Callable[[Array], Array]
+_SPREAD = ("mean", "smallest", "smallest_at", "largest", "largest_at", "sigma", "left_out_rms")
 
 
 @command("profiler clock", keys=("pitch", "side", "z"), short_help="Find a profiler's clock from a straight edge.")
@@ -170,7 +175,7 @@ def _offset(
     profiles: Profiles,
     stamps: Array,
     scale: float,
-    extract: Callable[[Array], Array],
+    extract: _Extract,
     z: str,
 ) -> tuple[LineClock, Array, int, dict[str, str]]:
     """Find the clock's offset, the times (n,) s of the crossings, the profiles without one, and the sign of z."""
@@ -199,13 +204,14 @@ def _offset(
 
 
 def _chosen(
-    fits: dict[str, SignFit], record: ProfilerRecord, total: int, what: str, alike: Callable[[], bool]
+    fits: dict[str, SignFit], record: ProfilerRecord | None, total: int, what: str, alike: Callable[[], bool]
 ) -> tuple[str, dict[str, str]]:
     """Return the sign of z and the words on it; the calibration's own where the profiles do not contradict it.
 
     Raises InputError where they do: X_FS holds for one sign only.
     """
-    own = next((g for g, word in WORDS.items() if word == record.figures.get("z_grows")), "")
+    figures = {} if record is None else record.figures
+    own = next((g for g, word in WORDS.items() if word == figures.get("z_grows")), "")
     if own in fits and 2 * fits[own].kept >= max(fit.kept for fit in fits.values()) > 0:
         fits = {own: fits[own]}
     grows, reason = choose_sign(fits, total, what, alike)
@@ -232,8 +238,13 @@ def seam(
     check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)
     data = _as_calibrated(read_measurements(call, file, unit, poses), calibration)
-    found = with_warnings(data, map_seam(data, calibration, folder, call.reading.get("z", "")))
-    return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
+    record = load_record(calibration)
+    figures, root_mm = map_seam(data, record, folder, call.reading.get("z", ""))
+    found = with_warnings(data, figures)
+    of = partial(ProfilerSeam, source=file.name, calibration=calibration, out=folder, limit_mm=limit_mm)
+    made = of(record=record, found=found, root_mm=root_mm)
+    write_atomic(folder / "report.html", seam_report(made))
+    return outcome_of(call, found, made)
 
 
 def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
@@ -252,39 +263,41 @@ def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
     return data
 
 
-def map_seam(file: Measurements, calibration: Path, folder: Path, z: str = "") -> dict[str, Any]:
-    """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
-    record = load_record(calibration)
-    if file.profiles is None:
-        raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
-    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
-    check_number(poses, (len(file.profiles),), "profiles")
+def map_seam(file: Measurements, record: ProfilerRecord, folder: Path, z: str = "") -> tuple[dict[str, Any], Array]:
+    """Write a V-groove's features of every profile in the base as seam.csv; return the summary, and the root in mm."""
+    features, lost, words = _shown_features(file.profiles, _groove, record, z, "V-groove")
     columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
-    found = {grows: with_sign(file.profiles, _groove, grows) for grows in signs_to_try(z)}
+    number, at, seen = _in_base(file, record, np.array(features)[:, :3], lost)
+    at *= 1e3
+    rms = 1e3 * np.array(features)[:, 3, :1]
+    rows = [[k, *(f"{v:.4f}" for v in row)] for k, row in zip(number, np.hstack([at.reshape(-1, 9), rms]), strict=True)]
+    write_atomic(folder / "seam.csv", csv_text(columns, rows))
+    figures: dict[str, Any] = {"scans": len(rms) + len(lost), "found": len(rms), "without_groove": lost, **words}
+    error_95_mm = middle_error_mm(record, seen.reshape(-1, 3))
+    figures |= {"rms_mm": float(np.median(rms)), "error_95_mm": error_95_mm, "method": record.method}
+    return figures, at[:, 1]
+
+
+def _shown_features(
+    profiles: Sequence[Array] | None, extract: _Extract, record: ProfilerRecord | None, z: str, what: str
+) -> tuple[list[Array], list[int], dict[str, str]]:
+    """Return the features of the profiles that show one, the numbers of the others, and the words on the sign of z.
+
+    Raises:
+        FeatureNotFound: no profile shows it. InputError: no profiles, or the calibration has the other sign.
+    """
+    if profiles is None:
+        name = what.removeprefix("V-")
+        raise InputError(f"The file has no 'profiles' of the {name}. Give (n, m, 2), or 'xz' with the lengths 'n'.")
+    found = {grows: with_sign(profiles, extract, grows) for grows in signs_to_try(z)}
     fits = {g: SignFit(shown=len(at), kept=len(at), variance=1.0, freedom=len(at)) for g, (at, _) in found.items()}
     if not any(fit.shown for fit in fits.values()):
         raise FeatureNotFound(
-            f"None of the {len(poses)} profiles shows a V-groove with plate on both sides, with z"
+            f"None of the {len(profiles)} profiles shows a {what} with plate on both sides, with z"
             f" {' or '.join(WORDS[g] for g in fits)}. Check the file and its unit."
         )
-    grows, words = _chosen(fits, record, len(poses), "groove", lambda: False)
-    features, lost = found[grows]
-    rows, rms, seen = [], [], []
-    for k, f in zip(np.delete(np.arange(len(poses)), lost), features, strict=True):
-        seen.append(record.points_F(f[:3]))
-        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
-        rms.append(float(f[3, 0]))
-        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * rms[-1]:.4f}"])
-    write_atomic(folder / "seam.csv", csv_text(columns, rows))
-    return {
-        "scans": len(poses),
-        "found": len(rms),
-        "without_groove": lost,
-        **words,
-        "rms_mm": 1e3 * float(np.median(rms)),
-        "error_95_mm": middle_error_mm(record, np.vstack(seen)),
-        "method": record.method,
-    }
+    grows, words = _chosen(fits, record, len(profiles), what.removeprefix("V-"), lambda: False)
+    return *found[grows], words
 
 
 def _groove(profile: Array) -> Array:
@@ -293,20 +306,73 @@ def _groove(profile: Array) -> Array:
     return np.vstack([f.points, [f.rms_m, 0.0]])
 
 
-def finish_seam(
-    found: dict[str, Any], calibration: Path, source: str, out: Path, limit_mm: float | None
-) -> ProfilerSeam:
-    """Write the report of a mapped seam, from the seam.csv beside it."""
-    columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
-    root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
-    seam = ProfilerSeam(
-        record=load_record(calibration),
-        found=found,
-        root_mm=root,
-        source=source,
-        calibration=calibration,
-        out=out,
-        limit_mm=limit_mm,
-    )
-    write_atomic(out / "report.html", seam_report(seam))
-    return seam
+@command("profiler bead", keys=("robot-form", "set", "trial", "pitch", "z"), short_help="Measure a bead on plates.")
+def bead(
+    call: Call,
+    file: FileArgument,
+    calibration: Annotated[
+        Path | None, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate; gives stations.")
+    ] = None,
+    unit: UnitOption = None,
+    poses: PosesOption = None,
+    toe_mm: Annotated[float, option("--toe-mm", "MM", "Height over the plates at a toe.", min=0.01)] = 1e3 * TOE_M,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Measure a bead's width, height and area in each profile, and its volume along the seam, as bead.csv."""
+    check_limit(limit_mm)
+    folder = call.folder("profiler", file.stem)
+    data = read_measurements(call, file, unit, poses, posed=calibration is not None)
+    record = None if calibration is None else load_record(calibration)
+    data = data if calibration is None else _as_calibrated(data, calibration)
+    course, figures = measure_bead(data, record, folder, 1e-3 * toe_mm, call.reading.get("z", ""))
+    found = with_warnings(data, figures)
+    made = ProfilerBead(record=record, found=found, course=course, source=file.name, out=folder, limit_mm=limit_mm)
+    write_atomic(folder / "report.html", made.page)
+    return outcome_of(call, found, made)
+
+
+def measure_bead(
+    file: Measurements, record: ProfilerRecord | None, folder: Path, toe_m: float, z: str
+) -> tuple[BeadCourse, dict[str, Any]]:
+    """Write a bead's values of every profile as bead.csv; return them along the seam, and the summary."""
+    shown, lost, words = _shown_features(file.profiles, partial(_bead, toe_m), record, z, "bead")
+    found, total = np.array(shown), len(shown) + len(lost)
+    number, points_B, middle = np.delete(np.arange(total), lost), None, np.full((len(shown), 3), np.nan)
+    if record is not None:
+        _, points_B, _ = _in_base(file, record, found[:, :4], lost)
+        middle = 1e3 * points_B[:, :2].mean(axis=1)
+    course = bead_course(found[:, 4:7, 0], found[:, 7:, 0], number, points_B)
+    at, scale = course.station * (1.0 if record is None else 1e3), np.array([unit for _, unit in BEAD.values()])
+    values, sigmas, left = scale * course.values, scale * course.sigmas, scale * course.left_out
+    table = np.column_stack([at, middle, values, sigmas, left])
+    rows = [[k, *(f"{v:.4f}" for v in row)] for k, row in zip(number, table, strict=True)]
+    columns = ["scan", "profile" if record is None else "station_mm", "x_mm", "y_mm", "z_mm"]
+    columns += [f"{key}{end}" for end in ("", "_sigma", "_left_out") for key in BEAD]
+    write_atomic(folder / "bead.csv", csv_text(columns, rows))
+    figures: dict[str, Any] = {"scans": total, "found": len(at), "without_bead": lost, **words}
+    for key, value, sigma, rest in zip(BEAD, values.T, sigmas.T, left.T, strict=True):
+        low, high, rms = np.argmin(value), np.argmax(value), np.sqrt(np.mean(rest**2))
+        numbers = (value.mean(), value[low], at[low], value[high], at[high], np.median(sigma), rms)
+        figures[key] = dict(zip(_SPREAD, map(float, numbers), strict=True))
+    figures["unlike_profiles"] = number[course.unlike].tolist()
+    if record is not None:
+        volume, sigma, length = bead_volume(course, number)
+        figures |= {"length_mm": 1e3 * length, "volume_mm3": 1e9 * volume, "volume_sigma_mm3": 1e9 * sigma}
+    return course, figures
+
+
+def _in_base(
+    file: Measurements, record: ProfilerRecord, points: Array, lost: list[int]
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the numbers of the profiles that are not lost, and their points (n, k, 2) m in base and flange."""
+    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
+    check_number(poses, (len(points) + len(lost),), "profiles")
+    number = np.delete(np.arange(len(poses)), lost)
+    points_F = record.points_F(points.reshape(-1, 2)).reshape(*points.shape[:2], 3)
+    return number, points_F @ poses.rotation[number].transpose(0, 2, 1) + poses.translation[number][:, None], points_F
+
+
+def _bead(toe_m: float, profile: Array) -> Array:
+    """Rows (10, 2): four points [x, z] m, then width m, height m, area m2 and the sigma of each in the first column."""
+    f = bead_features(profile, toe_m)
+    return np.vstack([f.points, np.outer([*f.values, *f.sigmas], [1.0, 0.0])])

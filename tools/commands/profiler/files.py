@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.checks import cut_off, read_rows
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.importing import import_profiles
+from weldcal.calibration.profiler.importing import import_profiles, profile_unit, profiles_of
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.reading_choice import Fit, choose_reading, flange_poses
 from weldcal.models.array_files import AnyArray, read_npz
@@ -144,6 +144,7 @@ def read_profiler_file(
     dataset: str = "",
     trial: int | None = None,
     stated: PosesStated | None = None,
+    posed: bool = True,
 ) -> Measurements:
     """Read an NPZ, a CSV, an export of a profiler or a folder with one file per profile.
 
@@ -151,6 +152,7 @@ def read_profiler_file(
         unit: m or mm, of all lengths, where the file does not say; a CSV says it in its header.
         dataset: of an NPZ with several sets, the one whose names begin so; trial: which of its trials or worlds.
         stated: what the user states of an export's poses.
+        posed: whether the flange's poses are read; they must be there.
 
     Raises:
         InputError: missing or unreadable file, missing or implausible unit, no such set or trial.
@@ -169,10 +171,16 @@ def read_profiler_file(
         file = Measurements(
             arrays=arrays, profiles=profiles, digest=sha256(path), warnings=() if told is None else (told,)
         )
-    else:
+    elif posed:
         file = _imported(path, unit, stated)
+    else:
+        alone = profiles_of(path, stated.pitch_mm)[0]
+        profiles = tuple(UNITS[profile_unit(alone, unit)] * p for p in alone.points)
+        file = Measurements(arrays={}, profiles=profiles, digest=digest_of(path))
     _check_numbers(path, file.arrays, file.profiles)
     X = file.poses()
+    if not posed:
+        return file
     if X is None:
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")
     if len(X) and float(np.abs(X.translation).max()) > FAR_M:

@@ -20,7 +20,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.options import Call, Outcome, option
 from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
-from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report
+from weldcal.tools.report.profiler_file import NUMBERS, ProfilerBead, ProfilerFile, ProfilerSeam, profiler_report
 from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300
@@ -40,11 +40,11 @@ TouchesOption = Annotated[Path | None, option("--touches", "FILE", "CSV of flang
 TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flange frame, mm.")]
 
 
-def read_measurements(call: Call, file: Path, unit: str | None, poses: Path | None) -> Measurements:
-    """Read a file as --as states it."""
+def read_measurements(call: Call, file: Path, unit: str | None, poses: Path | None, posed: bool = True) -> Measurements:
+    """Read a file as --as states it, with the flange's poses if ``posed``."""
     stated = PosesStated(poses, call.reading.get("robot-form", ""), call.reading.get("pitch"))
     known = {"dataset": call.reading.get("set", ""), "trial": call.reading.get("trial")}
-    return read_profiler_file(file, unit=unit, **known, stated=stated)
+    return read_profiler_file(file, unit=unit, **known, stated=stated, posed=posed)
 
 
 def with_warnings(data: Measurements, found: Mapping[str, Any]) -> dict[str, Any]:
@@ -69,14 +69,14 @@ def understood(data: Measurements) -> list[str]:
     return [*lines, *data.notes]
 
 
-def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | ProfilerSeam) -> Outcome:
+def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | ProfilerSeam | ProfilerBead) -> Outcome:
     """What is printed of a result."""
     warnings = found.get("warnings")
     # the first screen has them, and the JSON object has no first screen
     for sentence in warnings if isinstance(warnings, list) and call.json else []:
         console.emit_warning(str(sentence))
     rows: dict[str, str] = {}
-    for key in ("outlier_scans", "wrong_scans", "without_feature", "without_sphere", "without_groove", "wrong_sides"):
+    for key in NUMBERS:
         numbers = found.get(key)
         if isinstance(numbers, list) and numbers:
             rows[key.replace("_", " ")] = ", ".join(map(str, numbers))
