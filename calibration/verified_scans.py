@@ -202,6 +202,12 @@ def shifted_result(
     off = 1e3 * float(np.linalg.norm(offset.shift_m))
     if float(offset.shift_m @ np.linalg.solve(of_both, offset.shift_m)) <= limit:
         return None, f"Not corrected: an offset of {off:.3f} mm is chance here, and a shift would make it worse."
+    turn_sigma = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3] + offset.new.covariance[:3, :3])[-1]))
+    if offset.turn_rad > _EVIDENT * turn_sigma:
+        return None, (
+            f"Not corrected: X_BC is also turned by {np.degrees(offset.turn_rad):.2f} degrees, which a shift leaves."
+            " Calibrate from these scans."
+        )
     X = RigidTransform(result.X_BC.rotation(), result.X_BC.translation() - offset.shift_m)
     lever = np.eye(6)
     lever[3:, :3] = skew(offset.p_BQ - X.translation())  # the turn is about the point that is known
@@ -218,12 +224,6 @@ def shifted_result(
         f"X_BC is shifted by {off:.3f} mm, which {n} new scans show. At their middle it is known to"
         f" {1e3 * offset.sigma_m:.3f} mm (one sigma)."
     )
-    turn_sigma = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3] + offset.new.covariance[:3, :3])[-1]))
-    if offset.turn_rad > _EVIDENT * turn_sigma:
-        sentence += (
-            f" It is also turned by {np.degrees(offset.turn_rad):.2f} degrees, which a shift leaves: calibrate from"
-            " these scans to use it elsewhere."
-        )
     shifted = replace(
         result,
         X_BC=X,

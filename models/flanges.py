@@ -181,6 +181,8 @@ def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
     if not LEAST_RING_M <= outer <= LARGEST_RING_M:
         low, high = 1e3 * LEAST_RING_M, 1e3 * LARGEST_RING_M
         raise InputError(f"The circle '{name}' must be {low:.0f} to {high:.0f} mm wide: ring-OUTER-BORE, in mm.")
+    if bore <= 0.0:
+        raise InputError(f"The circle '{name}' needs a bore: ring-OUTER-BORE, in mm.")
     ring = flange_ring(outer, bore, designation=name)
     if not own["holes"]:
         return ring

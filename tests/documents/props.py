@@ -183,7 +183,9 @@ def _bead(path: Path) -> None:
     from tests.worlds.bead import seam
 
     made = seam(12, np.random.default_rng(0))
-    np.savez(path, T=made.X_BS, profiles=np.array(made.profiles), unit="m")
+    X_FS = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    T = made.X_BS @ np.linalg.inv(X_FS)  # flange poses, for about the mounting of my-profiler
+    np.savez(path, T=T, profiles=np.array(made.profiles), unit="m")
 
 
 def _profiler_result(path: Path) -> None:

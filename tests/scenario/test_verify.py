@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
 from tests.places import SHARED_DATA, needs
@@ -184,11 +184,24 @@ def test_a_scanner_that_was_pushed_is_corrected_by_new_scans(halves: tuple[Path,
 def test_a_good_calibration_is_not_corrected(halves: tuple[Path, Path], tmp_path: Path) -> None:
     report = verify_dataset(*halves, tmp_path / "out", VerifyOptions(correct=True))
     assert report.corrected is None
-    assert report.first.more["corrected"].startswith("Not corrected: an offset of 0.")
+    assert any(note.startswith("Not corrected: an offset of 0.") for note in report.first.found.notes)
     assert not (tmp_path / "out" / "corrected").exists()
     refused = CliRunner().invoke(app, ["verify", str(halves[0]), "--touch", "touches.csv", "--correct"])
     assert refused.exit_code == 2
     assert "--correct is for scans of a flange" in refused.output
+    both = ["verify", *map(str, halves), "--correct", "--as", "scanner-correction=no"]
+    assert "leave out --as scanner-correction=no" in " ".join(CliRunner().invoke(app, both).output.split())
+
+
+def test_a_turned_scanner_is_not_shifted(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    good = load_result(halves[0])
+    turned = RigidTransform(
+        good.X_BC.rotation() @ RotationMatrix.MakeZRotation(np.radians(1.0)), good.X_BC.translation()
+    )
+    result = _result(tmp_path / "turned", replace(good, X_BC=turned))
+    report = verify_dataset(result, halves[1], tmp_path / "out", VerifyOptions(correct=True))
+    assert report.corrected is None
+    assert "Calibrate from these scans." in report.shift
 
 
 def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tmp_path: Path) -> None:

@@ -100,10 +100,10 @@ class KeyedCommand(TyperCommand):
             name, attached, value = word.partition("=")
             key = name[2:].removeprefix("no-")
             if name.startswith("--") and key in self.keys:
-                if key in YES_NO:
+                if not attached:
+                    value = "".join(word for word in args[after : after + 1] if not word.startswith("-"))
+                if key in YES_NO and value not in ("yes", "no"):
                     value = "no" if name.startswith("--no-") else "yes"
-                elif not attached:
-                    value = "".join(args[after : after + 1])
                 ctx.fail(f"The option {name} is a key of --as now: write --as {shlex.quote(f'{key}={value}')}.")
         return super().parse_args(ctx, args)
 

@@ -262,6 +262,8 @@ def _read_keys(given: Iterable[str], keys: tuple[str, ...]) -> dict[str, Any]:
 
             known = did_you_mean(key, keys, f"the keys of this command are {', '.join(keys)}.", 0.5)
             raise typer.BadParameter(f"there is no key '{key}'; {known}", param_hint="'--as'")
+        if key in found:
+            raise typer.BadParameter(f"{key} is given twice: give it once.", param_hint="'--as'")
         what, read = KEYS[key]
         try:
             found[key] = {text: read(text)}[text or key]

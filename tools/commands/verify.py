@@ -98,6 +98,8 @@ def verify(
         )
     if correct and (dataset is None or board is not None or not holds_scans(dataset)):
         raise typer.BadParameter("--correct is for scans of a flange")
+    if correct and not call.reading.get(OF_SCANS, True):
+        raise typer.BadParameter("--correct shifts the pose of corrected points: leave out --as scanner-correction=no")
     if touch is not None or scenario is not None:
         from weldcal.tools.commands.touch import live_touches_outcome, touches_outcome
     if scenario is not None:
@@ -123,7 +125,7 @@ def verify(
         paired = verify_on_pairs(result, dataset, folder, known, limit_mm=limit_mm, options=tuple(words))
         return Outcome(paired.summary(), values={}, rows=paired.rows(), first=paired.first)
     if of_pairs or mounting is not None:
-        surplus = of_pairs[0][0] if of_pairs else "--mounting"
+        surplus = " ".join(of_pairs[0]) if of_pairs else "--mounting"
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
     asked = VerifyOptions(
         flange=flange,

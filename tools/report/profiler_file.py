@@ -56,11 +56,11 @@ _LOST = {
     "without_feature": "{n} of {all} profiles show no edge and were not used.",
     "without_sphere": "{n} of {all} profiles show no sphere and were not used.",
     "without_groove": "{n} of {all} profiles show no groove.",
-    "without_bead": "{n} of {all} profiles show no bead: a gap, or bad returns.",
     "outlier_scans": "{n} of {all} points lie off the edge and were not used.",
     "wrong_scans": "{n} of {all} scans lie off the sphere and were not used.",
 }
 _GRAVE = {
+    "without_bead": "{n} of {all} profiles show no bead: look for a gap there (bead.csv), or bad returns.",
     "wrong_sides": "The side of the sphere's centre is likely wrong in {n} of {all} scans: check their sign.",
     "unlike_profiles": "{n} of {all} profiles are unlike their neighbours: look for a gap, a bulge or spatter there.",
 }

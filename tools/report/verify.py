@@ -108,7 +108,7 @@ class VerifyReport(VerifiedScans):
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (*self.notes, correction_note(r, self.calibration)))),
+            notes=tuple(filter(None, (*self.notes, self.shift, correction_note(r, self.calibration)))),
             settled=settled,
         )
         if len(new):
@@ -134,8 +134,6 @@ class VerifyReport(VerifiedScans):
                 f"({x}, {y}, {z}) mm +- {1e3 * o.sigma_m:.3f} mm (one sigma) and {np.degrees(o.turn_rad):.3f} degrees"
                 " from the new solution. The vector is in the base, at the middle of these scans."
             )
-        if self.shift:
-            more["corrected"] = self.shift
         return FirstScreen(found, expected, self._next(), tuple(poses), more)
 
     def _next(self) -> Next:

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
+from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 
 REACH_M = 5e-3  # to each side, along which the seam's direction is taken
 NEIGHBOURS, FEWEST = 10, 5  # profiles that predict one, on both sides where there are; profiles that can at all
+_ALONG = 0.4  # share of a section across the travel below which its pose is another profile's: 66 deg aslant
 UNLIKE, ALIKE = 5.0, 0.02  # what is left out of a profile unlike the others: sigmas, and share of the value
 
 
@@ -41,6 +43,9 @@ def bead_course(
         values: width m, height m and area m2 of each profile, (n, 3); sigmas: of each.
         number: of each profile, (n,).
         points_B: toes, crown and the plate below it in the base, (n, 4, 3) m; None where no pose is known.
+
+    Raises:
+        InconsistentData: the profiles lie along the travel of their poses.
     """
     station = np.asarray(number, np.float64)
     if points_B is not None:
@@ -75,6 +80,11 @@ def _placed(points_B: Floats) -> tuple[Floats, Floats]:
     wide, up = _unit(points_B[:, 1] - points_B[:, 0]), points_B[:, 2] - points_B[:, 3]
     up = _unit(up - np.sum(up * wide, axis=1, keepdims=True) * wide)
     width = np.linalg.norm(np.cross(wide, tangent), axis=1)
+    if len(width) > 2 and np.median(width) < _ALONG:
+        raise InconsistentData(
+            "The profiles lie along the travel of their poses, not across it. Give the poses of these profiles, in"
+            " their order and form, and the calibration of this profiler."
+        )
     area = np.abs(np.sum(tangent * np.cross(wide, up), axis=1))
     station = np.concatenate([[0.0], np.cumsum(np.sum(step * (tangent[:-1] + tangent[1:]), axis=1) / 2.0)])
     return station, np.column_stack([width, area / width, area])

@@ -89,6 +89,7 @@ def test_a_user_calibrates_by_the_wrist_ring(tmp_path: Path) -> None:
     ("name", "said"),
     [
         ("ring-900-63", "must be 30 to 250 mm wide"),
+        ("ring-90-0", "needs a bore"),
         ("ring-90-89", "has no flat face left"),
         ("ring-90-63-70-6-m12", "leaves its flat face"),
         ("ring-90", "or ring-OUTER-BORE in mm"),

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.calibration.profiler.test_cli import called, found
 from tests.worlds.bead import TOE_M, Section, Sensor, profile, seam, sections
-from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.errors import FeatureNotFound, InconsistentData
 from weldcal.calibration.profiler.features.bead import bead_features
+from weldcal.calibration.profiler.features.bead_course import bead_course
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.errors import InputError
 
@@ -146,6 +147,19 @@ def test_along_a_seam_the_oblique_sections_are_turned_across_it(tmp_path: Path) 
     assert answer["width_mm"]["left_out_rms"] < 0.3
     assert answer["height_mm"]["largest_at"] == pytest.approx(41.0, abs=2.0)
     assert "unlike their neighbours" in (tmp_path / "out/report.html").read_text()
+
+
+def test_poses_whose_travel_is_along_the_profiles_are_refused() -> None:
+    k = np.arange(12)[:, None, None] * 3e-3
+    section = np.array([[-4e-3, 0.0, 0.0], [4e-3, 0.0, 0.0], [0.0, 0.0, 2e-3], [0.0, 0.0, 0.0]])
+    values, sigmas = np.tile([8e-3, 2e-3, 1e-5], (12, 1)), np.full((12, 3), 1e-5)
+    number = np.arange(12)
+    right = bead_course(values, sigmas, number, section + k * [0.0, 1.0, 0.0])
+    assert right.values == pytest.approx(values)
+    aslant = bead_course(values, sigmas, number, section + k * [np.sin(1.0), np.cos(1.0), 0.0])
+    assert aslant.values[:, 0] == pytest.approx(8e-3 * np.cos(1.0))
+    with pytest.raises(InconsistentData, match="along the travel of their poses"):
+        bead_course(values, sigmas, number, section + k * [1.0, 0.1, 0.0])
 
 
 def test_spatter_at_a_toe_is_named_by_its_neighbours(tmp_path: Path) -> None:
