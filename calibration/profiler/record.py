@@ -86,8 +86,8 @@ class ProfilerRecord:
             return poses
         if q is None:
             raise InputError(
-                "This calibration corrects the arm's joints: give the joints q with the scans, or calibrate without"
-                " --model affine+joints."
+                "This calibration corrects the arm's joints: give the joints q with the scans, or calibrate"
+                " with --model affine."
             )
         return self.arm.poses(q, self.offsets, self.sag, self.arm.loads(q))
 
