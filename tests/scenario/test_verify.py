@@ -184,7 +184,7 @@ def test_a_scanner_that_was_pushed_is_corrected_by_new_scans(halves: tuple[Path,
 def test_a_good_calibration_is_not_corrected(halves: tuple[Path, Path], tmp_path: Path) -> None:
     report = verify_dataset(*halves, tmp_path / "out", VerifyOptions(correct=True))
     assert report.corrected is None
-    assert any(note.startswith("Not corrected: an offset of 0.") for note in report.first.found.notes)
+    assert report.first.more["corrected"].startswith("Not corrected: an offset of 0.")
     assert not (tmp_path / "out" / "corrected").exists()
     refused = CliRunner().invoke(app, ["verify", str(halves[0]), "--touch", "touches.csv", "--correct"])
     assert refused.exit_code == 2

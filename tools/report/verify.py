@@ -108,7 +108,7 @@ class VerifyReport(VerifiedScans):
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (*self.notes, self.shift, correction_note(r, self.calibration)))),
+            notes=tuple(filter(None, (*self.notes, correction_note(r, self.calibration)))),
             settled=settled,
         )
         if len(new):
@@ -124,7 +124,7 @@ class VerifyReport(VerifiedScans):
             )
         judged = scanner_pose(r)
         poses = [replace(judged, symbol=f"{judged.symbol}, judged")]
-        more: dict[str, str] = {}
+        more = {"corrected": self.shift} if self.shift else {}
         if (o := self.offset) is not None:
             words = f"{judged.words}, from these scans alone"
             name = f"{judged.symbol}, new solution"
