@@ -88,7 +88,7 @@ class VerifiedScans:
     Attributes:
         observations: with the scanner correction, where the result has one.
         limit_mm, source: limit of the median of new scans and where it is from; None: the calibration states no error.
-        doubts: sentences that leave the verdict at "use with care"; ``other_arm`` says that the arm has another name.
+        concerns: sentences that leave the verdict at "use with care"; ``other_arm`` says that the arm has another name.
         flange: what an option must state for these scans.
         notes: how the files were read.
         offset: how far X_BC is off by the new scans alone; None where they are too few.
@@ -105,7 +105,7 @@ class VerifiedScans:
     hashes: dict[str, str]
     limit_mm: float | None = None
     source: str = ""
-    doubts: tuple[str, ...] = ()
+    concerns: tuple[str, ...] = ()
     other_arm: str = ""
     notes: tuple[str, ...] = ()
     offset: Offset | None = None
@@ -169,7 +169,7 @@ def verify_scans(
         hashes=data.hashes,
         limit_mm=limit_mm,
         source=source,
-        doubts=(*differences, *_gross(calibration, poses), *judged.sentences, *_alike(data, observations)),
+        concerns=(*differences, *_gross(calibration, poses), *judged.sentences, *_alike(data, observations)),
         other_arm=other_arm,
         notes=read_as if evident else (*read_as, *without),
         offset=offset,

@@ -202,10 +202,10 @@ class ProfilerBead:
         alone = () if self.record else (_UNPOSED,)
         found = Findings(tolerance=tolerance, concerns=(*self.found.get("warnings", ()), *alone, *grave), notes=notes)
         step = Next("Compare some widths and heights of bead.csv with a gauge or a cut.", uses=True)
-        at, rows = "station" if self.record else "profile", {}
+        at, rows = "station {:.1f} mm" if self.record else "profile {:.0f}", {}
         for key, (unit, _) in BEAD.items():
             of = self.found[key]
-            ends = [f"{of[end]:.2f} {unit} at {at} {of[f'{end}_at']:.1f}" for end in ("smallest", "largest")]
+            ends = [f"{of[end]:.2f} {unit} at {at.format(of[f'{end}_at'])}" for end in ("smallest", "largest")]
             spread = f"one sigma {of['sigma']:.3f}, left out {of['left_out_rms']:.3f}".replace("nan", "not known")
             rows[key.partition("_")[0]] = f"{of['mean']:.2f} {unit}, from {' to '.join(ends)}; {spread}"
         return FirstScreen(found, ExpectedError(what, f"{error:.3f} mm", fit), step, more=rows)

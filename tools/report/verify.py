@@ -90,8 +90,8 @@ class VerifyReport(VerifiedScans):
         said += f", within the limit of {limit_mm:.3f} mm, {source}"
         if len(new) < FEW:
             return Verdict(CARE, limit_mm, f"{said}; fewer than {FEW} new scans say little.")
-        if self.doubts:
-            return Verdict(CARE, limit_mm, f"{said}. But: {self.doubts[0]}")
+        if self.concerns:
+            return Verdict(CARE, limit_mm, f"{said}. But: {self.concerns[0]}")
         return Verdict(USE, limit_mm, f"{said}.")
 
     @property

@@ -51,15 +51,17 @@ def calibrated(name: str, seed: int) -> CalibrationEstimate:
 
 
 def test_the_truth_is_in_the_region_of_46_to_50_of_50_circles() -> None:
-    inside = 0
+    squared = []
     for seed in range(SETS):
         rng = np.random.default_rng([seed, 91])
         outer = rng.uniform(40.0, 200.0)
         found = calibrated(f"ring-{outer:.1f}-{outer * rng.uniform(0.4, 0.7):.1f}", seed)
         turn = rotation_vector(X_BC.rotation() @ found.X_BC.rotation().inverse())
         e = np.concatenate([turn, X_BC.translation() - found.X_BC.translation()])
-        inside += float(e @ np.linalg.solve(found.covariance, e)) < chi2.ppf(0.95, 6)
-    assert 46 <= inside <= 50
+        squared.append(float(e @ np.linalg.solve(found.covariance, e)))
+    assert 46 <= sum(s < chi2.ppf(0.95, 6) for s in squared) <= 50
+    # 6 on average where the covariance is right; with sigmas half or twice as large 24 or 1.5
+    assert 3.0 < np.mean(squared) < 12.0
 
 
 def test_a_user_calibrates_by_the_wrist_ring(tmp_path: Path) -> None:

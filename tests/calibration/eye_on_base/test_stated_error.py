@@ -176,7 +176,7 @@ def test_verify_gives_a_verdict_and_ends_with_1_where_it_is_no(
     assert (f"The verdict is: {verdict}" in run.stderr) == bool(code)
 
 
-def test_few_new_scans_and_doubts_leave_it_at_care(tmp_path: Path) -> None:
+def test_few_new_scans_and_concerns_leave_it_at_care(tmp_path: Path) -> None:
     folder, data = verified(tmp_path, calibrated(14, 20), n=3)
     few = verify_dataset(folder, data, tmp_path / "few").verdict
     assert few.verdict == "use with care"

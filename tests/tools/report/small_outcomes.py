@@ -123,7 +123,7 @@ def verify() -> Made:
         out=OUT,
         limit_mm=0.4,
         source="given",
-        doubts=("Something.",),
+        concerns=("Something.",),
     )
     return report.first, verify_report(report, dataset="others")
 

@@ -294,7 +294,7 @@ def _shown_features(
     if not any(fit.shown for fit in fits.values()):
         raise FeatureNotFound(
             f"None of the {len(profiles)} profiles shows a {what} with plate on both sides, with z"
-            f" {' or '.join(WORDS[g] for g in fits)}. Check the file and its unit."
+            f" {' or '.join(WORDS[g] for g in fits)}. Check the file, its unit{' and --toe-mm' * (what == 'bead')}."
         )
     grows, words = _chosen(fits, record, len(profiles), what.removeprefix("V-"), lambda: False)
     return *found[grows], words

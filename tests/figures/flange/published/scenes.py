@@ -94,10 +94,14 @@ def published_centre(points: Array, near_m: float, far_m: float, seed: int = 0) 
 
 @dataclass(frozen=True)
 class Scenes:
-    """What both methods find in the same scenes: observations by scene, and the errors (n,) m of their centres."""
+    """What both methods find in the same scenes, and the true centres: observations by scene.
+
+    ``centre_m``: by how much each centre is off.
+    """
 
     published: dict[str, Observation]
     ours: dict[str, Observation]
+    true: dict[str, Observation]
     centre_m: dict[str, tuple[float, float]]
 
 
@@ -106,13 +110,14 @@ def search(cell: Cell, n: int, seed: int) -> Scenes:
     rng = np.random.default_rng(seed)
     o3d.utility.random.seed(seed)
     scanner = get_scanner(cell.scanner, cell.columns)
-    found = Scenes({}, {}, {})
+    found = Scenes({}, {}, {}, {})
     for k in range(n):
         p = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(cell.near_m, cell.far_m)])
         X_CR = facing(p, np.radians(rng.uniform(0.0, 25.0)), *rng.uniform(0.0, 2.0 * np.pi, 2))
         scene = flange_frame(scanner, FLANGE, rng, X_CR=X_CR).points_C
         X_BR = X_BC @ X_CR
         X_BR = RigidTransform(X_BR.rotation(), X_BR.translation() + REPEAT_M * rng.normal(size=3))
+        found.true[str(k)] = Observation(str(k), X_BR, X_CR.translation())
         flat = scene.reshape(-1, 3)
         flat = flat[np.isfinite(flat).all(axis=1)]
         off = [np.inf, np.inf]
@@ -132,10 +137,10 @@ def search(cell: Cell, n: int, seed: int) -> Scenes:
     return found
 
 
-def held_out(observations: dict[str, Observation], judges: dict[str, Observation], *, ours: bool) -> Array:
-    """Errors m of a calibration by every second scene, at weldcal's centres of the others."""
+def held_out(observations: dict[str, Observation], true: dict[str, Observation], *, ours: bool) -> Array:
+    """Errors m of a calibration by every second scene, at the true centres of the others."""
     fitted = [o for name, o in observations.items() if int(name) % 2 == 0]
-    rest = [o for name, o in judges.items() if int(name) % 2]
+    rest = [o for name, o in true.items() if int(name) % 2]
     if ours:
         X = estimate_eye_on_base(fitted, SolveConfig(leave_one_out=False)).X_BC
     else:
@@ -153,9 +158,9 @@ def flange_scenes(run: Run) -> None:
         for column, (method, observations) in enumerate((("published", found.published), ("weldcal", found.ours))):
             off = np.array([pair[column] for pair in found.centre_m.values()])
             right = off < FOUND_M
-            e = 1e3 * held_out(observations, found.ours, ours=bool(column))
+            e = 1e3 * held_out(observations, found.true, ours=bool(column))
             kept = {k: o for k, o in observations.items() if found.centre_m[k][column] < FOUND_M}
-            without = 1e3 * held_out(kept, found.ours, ours=bool(column))
+            without = 1e3 * held_out(kept, found.true, ours=bool(column))
             rows.append(
                 (
                     f"{cell.title}, {method}",
