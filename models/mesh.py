@@ -101,6 +101,22 @@ class TriMesh:
             self.area_vectors / np.maximum(np.linalg.norm(self.area_vectors, axis=1, keepdims=True), 1e-300)
         )
 
+    @cached_property
+    def scene(self) -> Any:
+        """The mesh as Open3D's scene of rays and distances."""
+        scene = o3d.t.geometry.RaycastingScene()
+        vertices, triangles = self.vertices.astype(np.float32), self.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
+        return scene
+
+    def distances(self, points: Floats) -> Floats:
+        """Distances (N,) m of points (N,3) m from the surface, negative inside where the mesh is closed."""
+        query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
+        # Open3D's sign is the parity of a ray's hits; of three rays the majority decides, as a ray may hit an edge
+        closed = self.watertight()
+        found = self.scene.compute_signed_distance(query, nsamples=3) if closed else self.scene.compute_distance(query)
+        return np.asarray(found.numpy(), dtype=np.float64)
+
     @property
     def bounds(self) -> Floats:
         """(2,3) smallest and largest coordinates, m."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -72,15 +71,14 @@ def model_from_solids(solids: Sequence[TriMesh], *, seed: int = 0) -> BodyModel:
     if not solids:
         raise InputError("This link has no solids: fuse a model from the scans instead.")
     rng = np.random.default_rng(seed)
-    scenes = [_scene(mesh) for mesh in solids]
     points, normals = [], []
     for k, mesh in enumerate(solids):
         p, n = mesh.sample(max(int(_SAMPLES_PER_M2 * mesh.area), 10), rng)
         probe = o3d.core.Tensor.from_numpy((p + _INSIDE_M * n).astype(np.float32))
         outside = np.ones(len(p), dtype=bool)
-        for j, scene in enumerate(scenes):
+        for j, other in enumerate(solids):
             if j != k:
-                outside &= scene.compute_signed_distance(probe).numpy() > 0.0
+                outside &= other.scene.compute_signed_distance(probe).numpy() > 0.0
         points.append(p[outside])
         normals.append(n[outside])
     return BodyModel(np.concatenate(points), np.concatenate(normals))
@@ -129,15 +127,6 @@ def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, r
     # a lone point has no neighbours to tell its plane from
     near = np.asarray(cKDTree(points).query(points, [8])[0])[:, 0] < _NORMAL_VOXELS * voxel
     return BodyModel(points[near], normals[near])
-
-
-def _scene(mesh: TriMesh) -> Any:
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(mesh.triangles.astype(np.uint32)),
-    )
-    return scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,8 @@ BASES, FLANGES = ("base", "base_link"), ("tool0", "flange", "ee_link", "link_ee"
 """Names of links that are taken for base and flange, the first that is there; otherwise the root, and the end of the
 chain."""
 UNLIMITED_RAD = 2.0 * np.pi  # of a continuous joint
-_PICTURES = ("visual", "collision")
+PICTURES = ("visual", "collision")
+"""Elements of a URDF's link that hold its shape, the finer one first."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -206,29 +207,7 @@ def read_urdf_chain(path: Path) -> Chain:
     Raises:
         InputError: the file cannot be read, or is no serial arm of revolute joints.
     """
-    try:
-        robot = ET.fromstring(read_text(path, LARGEST_DOCUMENT))
-    except ET.ParseError as error:
-        raise InputError(f"'{path.name}' is not XML: {error}; make a URDF of a xacro file with xacro first.") from error
-    if robot.tag != "robot" or any("xacro" in (e.tag if isinstance(e.tag, str) else "") for e in robot.iter()):
-        raise InputError(f"'{path.name}' is no URDF: make one of a xacro file with xacro first.")
-    for link in robot.iter("link"):
-        for picture in [e for e in link if e.tag in _PICTURES]:
-            link.remove(picture)  # kinematics needs no meshes, whose files may not be here
-    # Drake's parser takes a third of a second to import
-    from pydrake.multibody.parsing import Parser
-    from pydrake.multibody.plant import MultibodyPlant
-
-    plant = MultibodyPlant(time_step=0.0)
-    try:
-        (model,) = Parser(plant).AddModelsFromString(ET.tostring(robot, encoding="unicode"), "urdf")
-        above = {plant.get_joint(i).child_body().name(): plant.get_joint(i) for i in plant.GetJointIndices(model)}
-        bodies = {plant.get_body(i).name(): plant.get_body(i) for i in plant.GetBodyIndices(model)}
-        for name in bodies.keys() - above.keys():
-            plant.WeldFrames(plant.world_frame(), bodies[name].body_frame())
-        plant.Finalize()
-    except Exception as error:  # Drake raises RuntimeError for most, and other types
-        raise InputError(f"'{path.name}' cannot be read as a URDF: {' '.join(str(error).split())[:200]}") from error
+    plant, bodies, above = _parsed(path)
     base, flange = _base(bodies, above), _flange(path, bodies, above)
     joints = _between(path, base, flange, above)
     context = plant.CreateDefaultContext()
@@ -256,6 +235,58 @@ def read_urdf_chain(path: Path) -> Chain:
         position_upper=np.where(np.isfinite(high), high, UNLIMITED_RAD),
         velocity_limit=np.where(np.isfinite(speed), speed, np.pi),
     )
+
+
+def read_robot(path: Path) -> ET.Element:
+    """Return the XML of a URDF file. Raises InputError where it is none."""
+    try:
+        robot = ET.fromstring(read_text(path, LARGEST_DOCUMENT))
+    except ET.ParseError as error:
+        raise InputError(f"'{path.name}' is not XML: {error}; make a URDF of a xacro file with xacro first.") from error
+    if robot.tag != "robot" or any("xacro" in (e.tag if isinstance(e.tag, str) else "") for e in robot.iter()):
+        raise InputError(f"'{path.name}' is no URDF: make one of a xacro file with xacro first.")
+    return robot
+
+
+def _parsed(path: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Return Drake's plant of a URDF without its pictures, its bodies and the joint above each, by name."""
+    robot = read_robot(path)
+    for link in robot.iter("link"):
+        for picture in [e for e in link if e.tag in PICTURES]:
+            link.remove(picture)  # kinematics needs no meshes, whose files may not be here
+    # Drake's parser takes a third of a second to import
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(time_step=0.0)
+    try:
+        (model,) = Parser(plant).AddModelsFromString(ET.tostring(robot, encoding="unicode"), "urdf")
+        above = {plant.get_joint(i).child_body().name(): plant.get_joint(i) for i in plant.GetJointIndices(model)}
+        bodies = {plant.get_body(i).name(): plant.get_body(i) for i in plant.GetBodyIndices(model)}
+        for name in bodies.keys() - above.keys():
+            plant.WeldFrames(plant.world_frame(), bodies[name].body_frame())
+        plant.Finalize()
+    except Exception as error:  # Drake raises RuntimeError for most, and other types
+        raise InputError(f"'{path.name}' cannot be read as a URDF: {' '.join(str(error).split())[:200]}") from error
+    return plant, bodies, above
+
+
+def urdf_link_poses(path: Path, q: ArrayLike) -> dict[str, RigidTransform]:
+    """Poses X_BL of all links of a URDF file by name, at the joint angles q (n,) rad of its chain, the others at zero.
+
+    Raises InputError: see read_urdf_chain, or another number of angles.
+    """
+    plant, bodies, above = _parsed(path)
+    base = _base(bodies, above)
+    joints, angles = _between(path, base, _flange(path, bodies, above), above), np.asarray(q, dtype=float)
+    if len(joints) != len(angles):
+        raise InputError(f"'{path.name}' has {len(joints)} joints from base to flange, and {len(angles)} are given.")
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    for joint, angle in zip(joints, angles, strict=True):
+        joint.set_angle(context, angle)
+    X_WB = bodies[base].EvalPoseInWorld(context)
+    return {name: X_WB.InvertAndCompose(body.EvalPoseInWorld(context)) for name, body in bodies.items()}
 
 
 def _base(bodies: dict[str, Any], above: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh, revolve
+from weldcal.models.mesh import TriMesh, extrude, revolve
 
 FLANGE_DISC_M = 0.006  # the last millimetres before the flange plane, left to the flange's own mesh
 WRIST_3_RADIUS_M = 0.045  # of the UR10e; see wrist_3_size
@@ -307,20 +307,23 @@ def link_solids(arm: ArmModel, link: int) -> list[TriMesh]:
     return []
 
 
-def placed_solid(visual: ET.Element) -> TriMesh:
-    """Return the closed solid of a visual element of arm_urdf, in its link's frame, m."""
+def placed_solid(visual: ET.Element, mesh: TriMesh | None = None) -> TriMesh:
+    """Return the closed solid of a URDF's visual or collision element, or its ``mesh``, in its link's frame, m."""
     origin, geometry = visual.find("origin"), visual.find("geometry")
-    assert origin is not None
     assert geometry is not None
-    xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
-    return _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
+    place = {} if origin is None else origin.attrib
+    xyz, rpy = (np.array(place.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
+    return (mesh or _solid(geometry[0])).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
 
 
 def _solid(shape: ET.Element) -> TriMesh:
+    if shape.tag == "box":
+        x, y, z = (0.5 * float(v) for v in shape.get("size", "").split())
+        return extrude(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), -z, z)
     if shape.tag == "cylinder":
         r, half = float(shape.get("radius", "0")), 0.5 * float(shape.get("length", "0"))
         return revolve(np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)]), _SEGMENTS)
-    a, c = (float(shape.get(key, "0")) for key in "ac")
+    a, c = (float(shape.get(key, shape.get("radius", "0"))) for key in "ac")
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
     profile = np.column_stack([a * np.cos(angle), c * np.sin(angle)])
     profile[[0, -1], 0] = 0.0
