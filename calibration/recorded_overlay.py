@@ -28,6 +28,7 @@ from weldcal.models.robots import get_robot, stated_flange
 
 BAND_M = 0.02
 """A point so near to the robot's surface belongs to the robot: a choice, twice a calibration by a tape measure."""
+_SCALES_MM = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 1e3 * BAND_M)  # a choice: ends that a person reads at once
 _OFF_MM = 1.0  # of the flange by joints from its recorded pose: a choice, above what a factory calibration leaves
 
 
@@ -37,6 +38,7 @@ class Overlay:
 
     Attributes:
         scan: its id.
+        X_BC: pose of the scanner when it was taken.
         points_C, points_B: its measured points (N, 3) m, in the camera and in the base.
         distance: (N,) m from the nearest body, negative inside a closed mesh; NaN where it is above BAND_M.
         body: (N,) index of that body, -1 for none.
@@ -45,6 +47,7 @@ class Overlay:
     """
 
     scan: str
+    X_BC: RigidTransform
     points_C: Array
     points_B: Array
     distance: Array
@@ -56,6 +59,11 @@ class Overlay:
     def on_robot(self) -> NDArray[np.bool_]:
         """(N,) whether a point belongs to the robot."""
         return self.body >= 0
+
+    @property
+    def scale_mm(self) -> float:
+        """The end of a scale of colours: 95 % of the distances lie within."""
+        return next(s for s in _SCALES_MM if s >= min(self.rows()["robot"]["p95_mm"], _SCALES_MM[-1]))
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Statistics of the whole robot and of each body with points: how many, |distance| and the signed median, mm."""
@@ -131,7 +139,8 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
     points_C = data.cloud(id).reshape(-1, 3)
     points_C = points_C[np.isfinite(points_C).all(axis=1)]
     points_C = points_C if correction is None else correction.points(points_C)
-    points_B = (X_BF @ X if in_hand else X).multiply(points_C.T).T
+    X_BC = X_BF @ X if in_hand else X
+    points_B = X_BC.multiply(points_C.T).T
     distance, body = compare(points_B, bodies)
     if (body < 0).all():
         raise InputError(
@@ -140,6 +149,7 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
         )
     return Overlay(
         scan=id,
+        X_BC=X_BC,
         points_C=points_C,
         points_B=points_B,
         distance=distance,

@@ -199,3 +199,15 @@ def diverging(share: Array) -> NDArray[np.uint8]:
     blue, white, red = np.array([33, 102, 172.0]), np.array([247, 247, 247.0]), np.array([178, 24, 43.0])
     end = np.where(t < 0.0, blue, red)
     return np.asarray(white + (end - white) * np.abs(t)).round().astype(np.uint8)
+
+
+def set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
+    """Set background and camera of the viewer; all is drawn in B, and shown as the base is in the world."""
+    if not X_WB.IsExactlyIdentity():
+        meshcat.SetTransform("/drake", X_WB)
+        camera, target = camera + X_WB.translation(), X_WB @ target
+    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+    meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetCameraPose(camera, target)

@@ -1,4 +1,4 @@
-"""weldcal replay and view: repeat a recorded run bit for bit, and show the pages of a finished one."""
+"""weldcal replay and view: repeat a recorded run bit for bit, and show the pages of a finished one, or a scan."""
 
 import json
 import tempfile
@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
-from weldcal.models.files import UNFINISHED, require_whole
+from weldcal.models.files import UNFINISHED, require_whole, write_atomic
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.recording.player import Playback
@@ -25,7 +25,7 @@ from weldcal.systems.recording.scenario_files import unpacked
 from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools import console
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command, switch
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option, switch
 from weldcal.tools.commands.run import RECORDING, one_thread
 from weldcal.tools.commands.weld import killed_weld
 from weldcal.tools.report.first_screen import pose_rows
@@ -168,15 +168,34 @@ def _run(
 PAGES = ("report.html", RECORD_HTML, "recording.html", "seams.html", "tool.html")
 
 
-@command("view", common=LOOK, short_help="Show the report and the 3D recording of a finished run.")
+@command(
+    "view",
+    common=("out", "overwrite", "json", "debug"),
+    short_help="Show a finished run, or a scan over the robot's shape.",
+)
 def view(
     call: Call,
     result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],
+    dataset: Annotated[
+        Path | None, typer.Argument(help="Show a scan of this dataset over the robot, by distance.", show_default=False)
+    ] = None,
+    *,
+    scan: Annotated[str | None, option("--scan", "ID", "The scan of the dataset.", show_default="the first")] = None,
+    robot: Annotated[
+        str | None, option("--robot", "NAME", "Robot of the dataset: a name, or a URDF file with its meshes.")
+    ] = None,
     browser: Annotated[
         bool, switch("--browser/--no-browser", "Open the pages, or only print their paths.", show_default="browser")
     ] = True,
 ) -> Outcome:
-    """Show a run again: its 3D recording and its report; of a broken weld also how to go on."""
+    """Show a run again: its 3D recording and its report; of a broken weld also how to go on.
+
+    With DATASET: a scan in the base by RESULT, each point coloured by its distance from the robot's surface.
+    """
+    if dataset is not None:
+        return _view_scan(call, result, dataset, scan, robot, browser)
+    if scan or robot or call.out:
+        raise InputError("--scan, --robot and --out are for a scan: give its dataset after the result.")
     note = killed_weld(result) if result.is_dir() else ""
     if note and not any((result / name).exists() for name in PAGES):
         raise InputError(note)
@@ -184,9 +203,7 @@ def view(
     pages = [(result / RECORD_HTML).resolve()] if killed else find_pages(result)
     if note:
         console.emit_warning(note)
-    opened = browser and open_pages(pages)
-    if browser and not opened:
-        console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
+    opened = _opened(pages, browser)
     return Outcome(
         {"state": "done", "pages": pages, "opened": opened} | ({"note": note} if note else {}),
         text="\n".join(map(str, pages)),
@@ -209,6 +226,45 @@ def find_pages(result: Path) -> list[Path]:
             f"{result} holds neither report.html nor recording.html. Give the result folder of a finished run."
         )
     return pages
+
+
+def _view_scan(call: Call, result: Path, dataset: Path, scan: str | None, robot: str | None, browser: bool) -> Outcome:
+    """Write overlay.html and overlay.png of one scan, and print its distances."""
+    # only here: another view needs none of these
+    from weldcal.calibration.recorded_overlay import BAND_M, overlay
+    from weldcal.tools.dashboard.recording import scan_page
+    from weldcal.tools.report.pictures import overlay_picture
+
+    found = overlay(result, dataset, scan, robot)
+    out = call.folder("view", f"{dataset.resolve().name}-{found.scan}")
+    page, picture = (out.resolve() / f"overlay.{form}" for form in ("html", "png"))
+    write_atomic(picture, overlay_picture(found))
+    write_atomic(page, scan_page(found))
+    for note in found.notes:
+        console.emit_warning(f"{note[:1].upper()}{note[1:]}")
+    rows, measured = found.rows(), len(found.points_B)
+    texts = {
+        name: f"{r['points']} points; median {r['median_mm']:.2f}, 95 % {r['p95_mm']:.2f} mm; signed"
+        f" {r['signed_mm']:+.2f} mm"
+        for name, r in rows.items()
+    }
+    values = {
+        "scan": f"{found.scan}: {rows['robot']['points']} of {measured} points within {1e3 * BAND_M:g} mm of the robot",
+        **texts,
+        "page": str(page),
+        "picture": str(picture),
+    }
+    summary = {"scan": found.scan, "points": measured, "bodies": rows, "notes": found.notes}
+    opened = _opened([page], browser)
+    return Outcome({"state": "done", **summary, "pages": [page], "picture": picture, "opened": opened}, values=values)
+
+
+def _opened(pages: list[Path], browser: bool) -> bool:
+    """Open the pages where that is wanted, with a warning where it is not possible."""
+    opened = browser and open_pages(pages)
+    if browser and not opened:
+        console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
+    return opened
 
 
 def open_pages(pages: list[Path]) -> bool:

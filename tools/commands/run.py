@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import typer
 from pydrake.geometry import Meshcat, MeshcatParams
-from pydrake.math import RigidTransform
 
-from weldcal.models.arrays import Array
 from weldcal.models.documents import nearest
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
@@ -39,6 +37,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.kept import free_unused
 from weldcal.systems.viewer.live import LiveView
+from weldcal.systems.viewer.scene import set_the_scene
 from weldcal.tools import console
 from weldcal.tools.cli.options import LIVE, Call
 from weldcal.tools.connections import guard
@@ -176,7 +175,7 @@ def run_job(
             with closing(cell.station):
                 if meshcat is not None:
                     camera, target = cell.job.view()
-                    _set_the_scene(meshcat, camera, target, scenario.base.pose())
+                    set_the_scene(meshcat, camera, target, scenario.base.pose())
                 if source is not None:
                     source.facts = facts_of(cell, options.scenario, robot.title)
                 run = run_cell(cell, told, meshcat, options.realtime, ended, *(() if look is None else (None, look)))
@@ -227,18 +226,6 @@ def _dashboard(operator: Operator, meshcat: Meshcat | None, options: RunOptions)
                 source.end(held=True, reason="The run has failed: the reason is in the terminal.", replays=False)
         if options.keep_page is not None:
             options.keep_page(source.conclude, stack.pop_all().close)
-
-
-def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
-    """Set background and camera of the viewer; all is drawn in B, and shown as the base is in the world."""
-    if not X_WB.IsExactlyIdentity():
-        meshcat.SetTransform("/drake", X_WB)
-        camera, target = camera + X_WB.translation(), X_WB @ target
-    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
-    meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetCameraPose(camera, target)
 
 
 @dc.dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
@@ -20,10 +21,12 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arrays import Array
+from weldcal.systems.viewer.scene import diverging
 
 if TYPE_CHECKING:
     from weldcal.calibration.flange.fit import FlangeFit
     from weldcal.calibration.flange.observation import Observation
+    from weldcal.calibration.recorded_overlay import Overlay
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
 PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
@@ -107,6 +110,7 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
 
 MOST_SCANS = 48  # a choice: a page of eight rows; more would take megabytes and seconds
 _POINTS = 1500  # drawn a scan: a choice, dense at this size
+_DRAWN = 60_000  # of an overlay: a choice, more hide each other at this size
 _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good scanner
 
 
@@ -133,9 +137,33 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
         axes.plot(0.0, 0.0, "+", color="#111", markersize=5, markeredgewidth=0.8)
         axes.set_aspect("equal")
         axes.set_title(id, fontsize=7, pad=2)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=120, metadata={"Software": None}, facecolor="white")
-    return stream.getvalue()
+    return png(figure)
+
+
+def overlay_picture(found: Overlay) -> bytes:
+    """Draw a scan as the scanner sees it, its points on the robot by distance from the surface, and how many; PNG."""
+    limit, on = found.scale_mm, found.on_robot
+    distance = 1e3 * found.distance[on]
+    seen = 1e3 * found.points_C
+    figure, (left, right) = subplots(9.0, 4.6, 1, 2, width_ratios=[1.7, 1.0])
+    left.set_facecolor("#4a525a")  # the pale middle of the colours shows on it
+    colours = ListedColormap(diverging(np.linspace(-1.0, 1.0, 255)) / 255.0)
+    others, own = (np.random.default_rng(0).permutation(np.flatnonzero(mask))[:_DRAWN] for mask in (~on, on))
+    left.scatter(*seen[others, :2].T, c=GREY, s=0.3, linewidths=0)
+    dots = left.scatter(
+        *seen[own, :2].T, c=1e3 * found.distance[own], s=1.2, linewidths=0, cmap=colours, vmin=-limit, vmax=limit
+    )
+    low, high = np.percentile(seen[on, :2], [0.1, 99.9], axis=0)
+    margin = 0.08 * float((high - low).max())
+    left.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin), aspect="equal")
+    left.set(xlabel="camera x, mm", ylabel="camera y, mm", title=f"scan {found.scan}; light grey: not on the robot")
+    figure.colorbar(dots, ax=left, extend="both", label="distance from the robot's surface, mm (below 0: inside)")
+    right.hist(np.clip(distance, -limit, limit), bins=60, range=(-limit, limit), color=OURS)
+    right.axvline(0.0, color="#444", linewidth=0.8)
+    plain(right, f"distance, mm (beyond {limit:g}: at the ends)", "points")
+    size = found.rows()["robot"]
+    right.set_title(f"|distance|: median {size['median_mm']:.2f}, 95 % {size['p95_mm']:.2f} mm", fontsize=10)
+    return png(figure)
 
 
 def subplots(width: float, height: float, *grid: int, **settings: Any) -> tuple[Figure, Any]:
@@ -161,6 +189,13 @@ def plain(axes: Axes, x: str, y: str) -> None:
     axes.set(xlabel=x, ylabel=y)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
+
+
+def png(figure: Figure) -> bytes:
+    """Return the figure as PNG, the same bytes for the same data."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=120, metadata={"Software": None}, facecolor="white")
+    return stream.getvalue()
 
 
 def svg(figure: Figure, *all_axes: Axes) -> bytes:
