@@ -28,7 +28,8 @@ from weldcal.models.robots import get_robot, stated_flange
 
 BAND_M = 0.02
 """A point so near to the robot's surface belongs to the robot: a choice, twice a calibration by a tape measure."""
-_SCALES_MM = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 1e3 * BAND_M)  # a choice: ends that a person reads at once
+_NO_JOINTS = "The scans have no joint angles (q1, q2 ...)"
+_SCALES_MM = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 1e3 * BAND_M)  # a choice: read at once
 _OFF_MM = 1.0  # of the flange by joints from its recorded pose: a choice, above what a factory calibration leaves
 
 
@@ -119,7 +120,7 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
     X_BF, q = _in_motion(data, id, own) if isinstance(data, MotionDataset) else _at_rest(data, id, name)
     links, notes = _links(name, q, kinematics)
     if q is None and robot is not None:
-        raise InputError(f"--robot places the links by joint angles, and {notes[0]} Omit --robot, or add q1, q2 ....")
+        raise InputError(f"{_NO_JOINTS}, by which --robot places the links: add them, or omit --robot.")
     if q is not None:
         by_joints = chain_forward(load_chain(name, kinematics), q)
         off = 1e3 * float(np.linalg.norm(by_joints.translation() - X_BF.translation()))
@@ -195,10 +196,10 @@ def _in_motion(data: MotionDataset, id: str, own: Mapping[str, Any]) -> tuple[Ri
 def _links(name: str, q: Array | None, kinematics: Path | None) -> tuple[list[BodyShape], list[str]]:
     """Return the links of a robot as far as its shape and joints are known, with a sentence on their shape."""
     if q is None:
-        return [], ["the scans have no joint angles (q1, q2 ...), so only the flange is compared."]
+        return [], [f"{_NO_JOINTS}: only the flange is compared."]
     if is_urdf(name):
         return urdf_shape(Path(name), q), []
     if name not in known_arms():
-        return [], [f"the shape of the {name} is not known, so only the flange is compared: give --robot FILE.urdf."]
-    note = "the links are cylinders of the published radii: give --robot FILE.urdf for the maker's meshes."
+        return [], [f"The shape of the {name} is not known, so only the flange is compared: give --robot FILE.urdf."]
+    note = "The links are cylinders of the published radii: give --robot FILE.urdf for the maker's meshes."
     return arm_shape(load_arm(name, kinematics), q), [note]

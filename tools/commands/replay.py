@@ -241,7 +241,7 @@ def _view_scan(call: Call, result: Path, dataset: Path, scan: str | None, robot:
     write_atomic(picture, overlay_picture(found))
     write_atomic(page, scan_page(found))
     for note in found.notes:
-        console.emit_warning(f"{note[:1].upper()}{note[1:]}")
+        console.emit_warning(note)
     rows, measured = found.rows(), len(found.points_B)
     texts = {
         name: f"{r['points']} points; median {r['median_mm']:.2f}, 95 % {r['p95_mm']:.2f} mm; signed"

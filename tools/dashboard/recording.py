@@ -22,7 +22,8 @@ from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.values import scan_rows, weld_rows
 
 _PAGE = Path(__file__).parent / "page"
-_ROBOT, _ELSEWHERE, _BACKGROUND = Rgba(0.62, 0.66, 0.70, 0.45), Rgba(0.45, 0.48, 0.52, 1.0), [0.20, 0.22, 0.25]
+_ROBOT, _ELSEWHERE, _BACKGROUND = Rgba(0.62, 0.66, 0.70, 0.25), Rgba(0.45, 0.48, 0.52, 1.0), [0.20, 0.22, 0.25]
+_COLUMNS = "<th>part<th>points<th>median, unsigned<th>95 %, unsigned<th>median, signed"
 _POINTS, _POINT_M = 150_000, 0.0012  # a choice: some megabytes, and no gaps at a pixel of 1 mm
 _ROWS = 1500  # of the weld, in the page
 
@@ -60,14 +61,17 @@ def scan_page(found: Overlay) -> str:
     set_the_scene(meshcat, middle + 1.3 * size * towards / np.linalg.norm(towards), middle, RigidTransform())
     meshcat.SetProperty("/Background", "top_color", _BACKGROUND)
     meshcat.SetProperty("/Background", "bottom_color", _BACKGROUND)
-    rows = [f"{escape(n)}: {r['median_mm']:.2f}, {r['p95_mm']:.2f} mm, {r['points']}" for n, r in found.rows().items()]
+    rows = "".join(
+        f"<tr><td>{escape(name)}<td>{r['points']:.0f}<td>{r['median_mm']:.2f}<td>{r['p95_mm']:.2f}<td>{r['signed_mm']:+.2f}"
+        for name, r in found.rows().items()
+    )
     head, end, tail = meshcat.StaticHtml().rpartition("</body>")
     keys = (
         f"<div class=scale>distance from the robot's surface<i></i><span class=ends><span>inside {limit:g} mm</span>"
         f"<span>0</span><span>{limit:g} mm outside</span></span></div><div>grey: not on the robot (over"
         f" {1e3 * BAND_M:g} mm)</div>"
     )
-    top = f"<strong>Scan {escape(found.scan)}</strong> median and 95 % of |distance|, points<br>{'<br>'.join(rows)}"
+    top = f"<strong>Scan {escape(found.scan)}: distance, mm</strong><table cellpadding=3><tr>{_COLUMNS}</tr>{rows}</table>"
     return f"{head}<style>{_style()}</style><div id=w-top>{top}</div><div id=w-keys>{keys}</div>{end}{tail}"
 
 

@@ -110,6 +110,7 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
 
 MOST_SCANS = 48  # a choice: a page of eight rows; more would take megabytes and seconds
 _POINTS = 1500  # drawn a scan: a choice, dense at this size
+_INK = 5e4  # points of print squared that the dots of an overlay cover: about its half, a choice
 _DRAWN = 60_000  # of an overlay: a choice, more hide each other at this size
 _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good scanner
 
@@ -150,19 +151,19 @@ def overlay_picture(found: Overlay) -> bytes:
     colours = ListedColormap(diverging(np.linspace(-1.0, 1.0, 255)) / 255.0)
     others, own = (np.random.default_rng(0).permutation(np.flatnonzero(mask))[:_DRAWN] for mask in (~on, on))
     left.scatter(*seen[others, :2].T, c=GREY, s=0.3, linewidths=0)
-    dots = left.scatter(
-        *seen[own, :2].T, c=1e3 * found.distance[own], s=1.2, linewidths=0, cmap=colours, vmin=-limit, vmax=limit
-    )
+    dots = left.scatter(*seen[own, :2].T, c=1e3 * found.distance[own], cmap=colours, vmin=-limit, vmax=limit)
+    dots.set(sizes=[min(9.0, _INK / len(own))], linewidths=0)
     low, high = np.percentile(seen[on, :2], [0.1, 99.9], axis=0)
     margin = 0.08 * float((high - low).max())
     left.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin), aspect="equal")
     left.set(xlabel="camera x, mm", ylabel="camera y, mm", title=f"scan {found.scan}; light grey: not on the robot")
-    figure.colorbar(dots, ax=left, extend="both", label="distance from the robot's surface, mm (below 0: inside)")
+    figure.colorbar(dots, ax=left, extend="both", label="distance from the surface, mm (below 0: inside)")
     right.hist(np.clip(distance, -limit, limit), bins=60, range=(-limit, limit), color=OURS)
     right.axvline(0.0, color="#444", linewidth=0.8)
-    plain(right, f"distance, mm (beyond {limit:g}: at the ends)", "points")
+    plain(right, f"distance, mm (over {limit:g}: at its end)", "points")
     size = found.rows()["robot"]
-    right.set_title(f"|distance|: median {size['median_mm']:.2f}, 95 % {size['p95_mm']:.2f} mm", fontsize=10)
+    lengths = f"median {size['median_mm']:.2f} mm, 95 % {size['p95_mm']:.2f} mm"
+    right.set_title(f"{size['points']} points on the robot, unsigned:\n{lengths}", fontsize=9, loc="left")
     return png(figure)
 
 

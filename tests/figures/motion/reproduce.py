@@ -56,14 +56,19 @@ def _components(axes: Axes, t: Array, errors: Array, first: int) -> None:
         axes.plot(
             t[shown], errors[shown, first + k], ".-", ms=4, lw=0.8, color=_COLOURS[k], label=COMPONENTS[first + k]
         )
+    axes.margins(y=0.2)  # the legend lies above the lines
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
 
 
-def history_picture(t: Array, before: Array, after: Array) -> bytes:
-    """Draw Fig. 6: the error (N, 6) by ICP over time (N,) s, before and after synchronisation."""
+def history_picture(
+    t: Array,
+    before: Array,
+    after: Array,
+    titles: tuple[str, str] = ("poses at arrival", "joint estimate of X_BC and clock"),
+) -> bytes:
+    """Draw Fig. 6, or 7 of a link: the error (N, 6) by ICP over time (N,) s, before and after synchronisation."""
     figure, every = subplots(9.0, 6.0, 2, 2, sharex=True, sharey="row")
-    both = (("poses at arrival", before), ("joint estimate of X_BC and clock", after))
-    for column, (title, errors) in enumerate(both):
+    for column, (title, errors) in enumerate(zip(titles, (before, after), strict=True)):
         for row, (first, unit) in enumerate(((3, "mm"), (0, "degrees"))):
             axes = every[row, column]
             _components(axes, t, errors, first)

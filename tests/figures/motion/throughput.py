@@ -6,8 +6,9 @@ process are the cell's own; the arm's control is a simulated arm at 500 Hz in th
 
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,21 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from tests.figures.harness import Run, figure
+from tests.figures.motion.reproduce import after_picture, history_picture
 from tests.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
-from weldcal.calibration.data.motion_dataset import load_motion_dataset
-from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
+from weldcal.calibration.data.results import CalibrationResult, save_result
+from weldcal.calibration.data.scanner_correction import ARRIVAL, ScannerClock
 from weldcal.calibration.flange.warm_up import warm_up
+from weldcal.calibration.geometry.se3 import as_transform, rotation_vector
+from weldcal.calibration.motion.body import BodyTracker, link_motion, model_from_solids
 from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.recorded_overlay import Overlay, overlay
 from weldcal.models.arms.kinematics import load_arm
-from weldcal.models.arms.urdf import link_index
+from weldcal.models.arms.urdf import link_index, link_solids
+from weldcal.models.arrays import Array
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
 from weldcal.systems.drivers.simulated.streaming_scanner import FrameReplay
@@ -38,15 +45,18 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.monitor_body import track_link
 from weldcal.tools.console import Progress
+from weldcal.tools.report.pictures import overlay_picture
 
 LINK = "wrist_1_link"
+Draw = Callable[[MotionDataset, CalibrationResult, DriftHistory], None]
 _SIGMA = 1e-5  # rad and m: the calibration of the study is the truth, so that what is left is tracking
 
 
-def track_body(options: MotionOptions, link: str, tell: Progress) -> dict[str, DriftHistory]:
+def track_body(options: MotionOptions, link: str, tell: Progress, draw: Draw | None = None) -> dict[str, DriftHistory]:
     """Render a recording, track flange and link (by its mesh, and by a model fused from the scans).
 
-    The true calibration is used.
+    The true calibration is used. ``draw`` is called with the recording, the calibration and the link's tracking by its
+    mesh, while the recording's folder exists.
 
     Raises:
         InputError: the arm has no such link; before anything is rendered.
@@ -75,7 +85,47 @@ def track_body(options: MotionOptions, link: str, tell: Progress) -> dict[str, D
                 data, result, standard, link, fused=name == "fused", seed=options.seed, tell=lambda f: tell(link, f)
             )
             found[name] = watch(result, frames, body_motion, X_FR=X_LR, dropped=refused)
+        if draw is not None:
+            draw(data, result, found["mesh"])
     return found
+
+
+def link_errors(
+    data: MotionDataset, result: CalibrationResult, tracked: DriftHistory, link: str
+) -> tuple[Array, Array, Array]:
+    """Times (N,) s of frames, and the error (N, 6) deg and mm of a link by ICP of its mesh, in the link's axes.
+
+    With the robot's pose at the frame's arrival, and at its capture.
+    """
+    arm = load_arm(result.robot)
+    index = link_index(arm, link)
+    model, motion = model_from_solids(link_solids(arm, index)), link_motion(data.stream, arm, index)
+    tracker = BodyTracker(model)
+    frames = {frame.id: frame for frame in data.frames}
+    rows = []
+    for id, capture in zip(tracked.ids, tracked.clock.times + tracked.offsets, strict=True):
+        poses = [as_transform(X) for X in motion.poses(np.array([frames[id].arrival, capture]))]
+        seen = tracker.track(data.cloud(id), result.X_BC.inverse() @ poses[1])
+        if seen is not None:
+            X_BL = result.X_BC @ seen.X_CL
+            off = [X.inverse() @ X_BL for X in poses]
+            # of the middle of the body, which ICP shows best
+            moved = [1e3 * (X @ model.middle - model.middle) for X in off]
+            turned = [np.degrees(rotation_vector(X.rotation())) for X in off]
+            rows.append(np.concatenate([[capture], turned[0], moved[0], turned[1], moved[1]]))
+    found = np.array(rows)
+    return found[:, 0] - found[0, 0], found[:, 1:7], found[:, 7:]
+
+
+def scan_over_robot(data: MotionDataset, result: CalibrationResult, tracked: DriftHistory) -> Overlay:
+    """Compare the scan in the middle with the robot's shape (Fig. 8), at the capture that the tracking has found."""
+    k = len(tracked.ids) // 2
+    frame = next(frame for frame in data.frames if frame.id == tracked.ids[k])
+    late = frame.arrival - float(tracked.clock.times[k] + tracked.offsets[k])
+    clock = ScannerClock(kind=ARRIVAL, offset_s=late, sigma_s=None, jitter_s=None, reference_s=frame.arrival)
+    with tempfile.TemporaryDirectory() as folder:
+        save_result(replace(result, clock=clock), Path(folder))
+        return overlay(Path(folder), data.folder, frame.id)
 
 
 def body_row(w: DriftHistory) -> dict[str, float]:
@@ -88,10 +138,17 @@ def body_row(w: DriftHistory) -> dict[str, float]:
 
 @figure("whole-body", "tracking by the flange and by a wrist link, by its mesh and by a model fused from the scans")
 def whole_body(run: Run) -> None:
-    """Compare the tracking errors (Fig. 7 of the paper on motion)."""
+    """Compare the tracking errors; pictures of them and of a scan over the robot (Fig. 7 and 8 of the paper on motion)."""
     frames, width = run.size((12, 400), (200, 1068))
     options = MotionOptions(frames=frames, size=(width, round(0.749 * width)), seed=run.seed, surroundings=False)
-    rows = {name: body_row(w) for name, w in track_body(options, LINK, run.progress).items()}
+
+    def draw(data: MotionDataset, result: CalibrationResult, tracked: DriftHistory) -> None:
+        errors = link_errors(data, result, tracked, LINK)
+        run.write("wrist.svg", history_picture(*errors, ("poses at arrival", "poses at the capture found")))
+        run.write("wrist_after.svg", after_picture(errors[0], errors[2]))
+        run.write("overlay.png", overlay_picture(scan_over_robot(data, result, tracked)))
+
+    rows = {name: body_row(w) for name, w in track_body(options, LINK, run.progress, draw).items()}
     lines = ((name, *(f"{v:.3g}" for v in row.values())) for name, row in rows.items())
     run.table(LINK, ("tracked", "frames", "dropped", "rms mm", "mean mm", "spread mm"), lines)
 
