@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.checks import CONFIGURATIONS, IN_HAND, read_header
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
-from weldcal.calibration.data.results import RESULT_FILE, statistics
+from weldcal.calibration.data.results import RESULT_FILE
 from weldcal.calibration.data.scanner_correction import clock_from_document, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.geometry.se3 import as_transform
@@ -64,18 +65,18 @@ class Overlay:
     @property
     def scale_mm(self) -> float:
         """The end of a scale of colours: 95 % of the distances lie within."""
-        return next(s for s in _SCALES_MM if s >= min(self.rows()["robot"]["p95_mm"], _SCALES_MM[-1]))
+        return next(s for s in _SCALES_MM if s >= min(self.rows["robot"]["p95_mm"], _SCALES_MM[-1]))
 
+    @cached_property
     def rows(self) -> dict[str, dict[str, float]]:
         """Statistics of the whole robot and of each body with points: how many, |distance| and the signed median, mm."""
         chosen = {"robot": self.on_robot} | {body.name: self.body == k for k, body in enumerate(self.bodies)}
         return {name: _row(1e3 * self.distance[mask]) for name, mask in chosen.items() if mask.any()}
 
 
-def _row(distance_mm: Array) -> dict[str, float]:
-    size = statistics(np.abs(distance_mm), "median", "p95")
-    signed = float(np.median(distance_mm))
-    return {"points": len(distance_mm), "median_mm": size["median"], "p95_mm": size["p95"], "signed_mm": signed}
+def _row(mm: Array) -> dict[str, float]:
+    median, p95 = np.percentile(np.abs(mm), [50, 95])
+    return {"points": len(mm), "median_mm": float(median), "p95_mm": float(p95), "signed_mm": float(np.median(mm))}
 
 
 def compare(points_B: Array, bodies: Sequence[BodyShape]) -> tuple[Array, NDArray[np.intp]]:

@@ -33,7 +33,7 @@ def test_a_wrist_link_is_tracked_as_well_as_the_flange() -> None:
     _, before, after = drawn["errors"]
     assert np.linalg.norm(before[:, 3:], axis=1).max() > 10.0
     assert np.linalg.norm(after[:, 3:], axis=1).max() < 0.5
-    rows = drawn["scan"].rows()
+    rows = drawn["scan"].rows
     assert rows["robot"]["points"] > 5000
     assert abs(rows["wrist_1_link"]["signed_mm"]) < 0.1
     assert rows["wrist_1_link"]["median_mm"] < 0.5

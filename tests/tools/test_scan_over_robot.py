@@ -13,9 +13,9 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from tests.browser import Browser
-from tests.places import SHARED_DATA, needs
+from tests.places import ROOT, SHARED_DATA, needs
 from weldcal.calibration.recorded_overlay import compare, overlay
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.shape import arm_shape
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -147,27 +147,29 @@ def quaternion(R: Array) -> list[float]:
     return [float(w), *map(float, v)]
 
 
-def write_scan(folder: Path, points: Array, configuration: str = "eye_on_base", *, joints: bool = True) -> Path:
-    """A dataset of one scan, 'a'."""
+def write_scan(
+    folder: Path, points: Array, configuration: str = "eye_on_base", q: Array = Q, X: Array | None = None
+) -> Path:
+    """A dataset of one scan, 'a'; ``q`` may be empty."""
     (folder / "clouds").mkdir(parents=True)
     np.savez(folder / "clouds" / "a.npz", points=points)
-    X = boxes(Q)[1]
-    names = [f"q{k}" for k in range(1, 7)] if joints else []
+    X = boxes(Q)[1] if X is None else X
+    names = [f"q{k + 1}" for k in range(len(q))]
     with (folder / "poses.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *names])
-        rows.writerow(["a", *X[:3, 3], *quaternion(X[:3, :3]), *(Q if joints else [])])
+        rows.writerow(["a", *X[:3, 3], *quaternion(X[:3, :3]), *q])
     header = {"schema": 1, "robot": "", "flange": "iso9409-1-50-4-m6", "configuration": configuration}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(header | {"units": {"clouds": "m", "poses": "m"}}))
     return folder
 
 
-def write_result(folder: Path, X: Array, symbol: str = "X_BC") -> Path:
+def write_result(folder: Path, X: Array, symbol: str = "X_BC", **more: object) -> Path:
     """A calibration.yaml with a pose."""
     folder.mkdir()
     pose = {"matrix": X.tolist()}
     configuration = "eye_on_base" if symbol == "X_BC" else "eye_in_hand"
-    document = {"schema": 1, "configuration": configuration, symbol: pose}
+    document = {"schema": 1, "configuration": configuration, symbol: pose, **more}
     (folder / "calibration.yaml").write_text(yaml.safe_dump(document))
     return folder
 
@@ -197,7 +199,7 @@ def test_a_right_calibration_shows_the_noise_only(scene: tuple[Path, Array, Arra
     assert (found.on_robot == (owner >= 0)).mean() > 0.999
     assert [body.name for body in found.bodies] == ["base", *LINKS, "flange"]
     for k, name in enumerate(("base", *LINKS)):
-        row = found.rows()[name]
+        row = found.rows[name]
         assert row["points"] == pytest.approx((owner == k).sum(), rel=0.03), name
         assert abs(row["signed_mm"]) < 0.02, name
         # half of normal noise lies within 0.67 sigma along the ray, of which the normal takes a part
@@ -228,10 +230,39 @@ def test_a_scanner_on_the_flange_sees_the_base(scene: tuple[Path, Array, Array],
     points, owner, _ = cast(X_BC)
     data = write_scan(tmp_path / "data", points, "eye_in_hand")
     found = overlay(write_result(tmp_path / "r", np.linalg.inv(X_BF) @ X_BC, "X_FC"), data, None, urdf(folder))
-    assert found.rows()["base"]["points"] == pytest.approx((owner == 0).sum(), rel=0.03)
-    assert found.rows()["robot"]["p95_mm"] < 0.25
+    assert found.rows["base"]["points"] == pytest.approx((owner == 0).sum(), rel=0.03)
+    assert found.rows["robot"]["p95_mm"] < 0.25
     with pytest.raises(InputError, match=r"has scans of eye_in_hand, and .* holds X_BC: give its own result"):
         overlay(write_result(tmp_path / "other", X_BC), data, None, urdf(folder))
+
+
+def test_the_scanner_correction_is_applied(scene: tuple[Path, Array, Array], tmp_path: Path) -> None:
+    folder, _, _ = scene
+    data = write_scan(tmp_path / "data", cast(X_BC)[0] / 1.005)
+    correction = {"scale": 1.005, "gradient_per_m": [0.0, 0.0]}
+    corrected = write_result(tmp_path / "corrected", X_BC, scanner_correction=correction)
+    assert overlay(corrected, data, None, urdf(folder)).rows["robot"]["p95_mm"] < 0.25
+    plain = write_result(tmp_path / "plain", X_BC)
+    assert overlay(plain, data, None, urdf(folder)).rows["robot"]["median_mm"] > 1.0
+
+
+def test_links_and_flange_follow_the_kinematics_of_the_result(tmp_path: Path) -> None:
+    q = np.array([0.3, -1.2, 1.1, -1.0, -1.5, 0.4])
+    text = (ROOT / "models" / "arms" / "ur10e" / "default_kinematics.yaml").read_text()
+    kinematics = yaml.safe_load(text)
+    kinematics["kinematics"]["shoulder"]["z"] += 0.005
+    X_BF = np.array(forward_kinematics(load_arm("ur10e"), q).GetAsMatrix4())
+    angle = np.linspace(0.0, 2.0 * np.pi, 500)
+    ring = np.column_stack([0.018 * np.cos(angle), 0.018 * np.sin(angle), 0.0 * angle, 1.0 + 0.0 * angle])
+    truly = ring @ (moved(0.0, 0.0, 0.005) @ X_BF).T  # on the flat face of the flange, 5 mm above the nominal arm's
+    X = looking(X_BF[:3, 3] + 0.7 * X_BF[:3, 2], X_BF[:3, 3])
+    data = write_scan(tmp_path / "data", (truly @ np.linalg.inv(X).T)[:, :3], q=q, X=X_BF)
+    own = write_result(tmp_path / "own", X, robot="ur10e", kinematics_file="arm.yaml")
+    (own / "arm.yaml").write_text(yaml.safe_dump(kinematics))
+    found = overlay(own, data)
+    assert np.abs(found.distance).max() < 1e-4
+    nominal = overlay(write_result(tmp_path / "nominal", X, robot="ur10e"), data)
+    assert np.median(np.abs(nominal.distance)) > 0.001  # the sides are nearer than 5 mm
 
 
 def test_a_known_arm_is_its_drawn_tubes() -> None:
@@ -295,7 +326,7 @@ def test_a_mistake_is_one_sentence(
     X = moved(5.0, 0.0, 0.0) @ X_BC if change == "elsewhere" else X_BC
     result = tmp_path / "result" if change == "no_result" else write_result(tmp_path / "result", X)
     if change == "no_joints":
-        data = write_scan(tmp_path / "data", cast(X_BC, 40)[0], joints=False)
+        data = write_scan(tmp_path / "data", cast(X_BC, 40)[0], q=np.array([]))
     if change == "no_mesh":
         (tmp_path / "mine" / "meshes" / "two.stl").unlink()
     words = [result, *([] if change == "no_dataset" else [data]), *([] if change == "no_robot" else robot)]

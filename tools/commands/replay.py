@@ -235,14 +235,16 @@ def _view_scan(call: Call, result: Path, dataset: Path, scan: str | None, robot:
     from weldcal.tools.dashboard.recording import scan_page
     from weldcal.tools.report.pictures import overlay_picture
 
+    call.progress("distances from the robot", 0.0)
     found = overlay(result, dataset, scan, robot)
+    call.progress("picture and page", 0.7)
     out = call.folder("view", f"{dataset.resolve().name}-{found.scan}")
     page, picture = (out.resolve() / f"overlay.{form}" for form in ("html", "png"))
     write_atomic(picture, overlay_picture(found))
     write_atomic(page, scan_page(found))
     for note in found.notes:
         console.emit_warning(note)
-    rows, measured = found.rows(), len(found.points_B)
+    rows, measured = found.rows, len(found.points_B)
     texts = {
         name: f"{r['points']} points; median {r['median_mm']:.2f}, 95 % {r['p95_mm']:.2f} mm; signed"
         f" {r['signed_mm']:+.2f} mm"

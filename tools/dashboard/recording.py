@@ -63,7 +63,7 @@ def scan_page(found: Overlay) -> str:
     meshcat.SetProperty("/Background", "bottom_color", _BACKGROUND)
     rows = "".join(
         f"<tr><td>{escape(name)}<td>{r['points']:.0f}<td>{r['median_mm']:.2f}<td>{r['p95_mm']:.2f}<td>{r['signed_mm']:+.2f}"
-        for name, r in found.rows().items()
+        for name, r in found.rows.items()
     )
     head, end, tail = meshcat.StaticHtml().rpartition("</body>")
     keys = (

@@ -161,7 +161,7 @@ def overlay_picture(found: Overlay) -> bytes:
     right.hist(np.clip(distance, -limit, limit), bins=60, range=(-limit, limit), color=OURS)
     right.axvline(0.0, color="#444", linewidth=0.8)
     plain(right, f"distance, mm (over {limit:g}: at its end)", "points")
-    size = found.rows()["robot"]
+    size = found.rows["robot"]
     lengths = f"median {size['median_mm']:.2f} mm, 95 % {size['p95_mm']:.2f} mm"
     right.set_title(f"{size['points']} points on the robot, unsigned:\n{lengths}", fontsize=9, loc="left")
     return png(figure)
