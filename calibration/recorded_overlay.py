@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.checks import CONFIGURATIONS, IN_HAND, read_header
-from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
+from weldcal.calibration.data.checks import IN_HAND, read_header
+from weldcal.calibration.data.dataset import joint_angles, load_dataset
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
-from weldcal.calibration.data.results import RESULT_FILE
+from weldcal.calibration.data.results import ON_BASE, RESULT_FILE
 from weldcal.calibration.data.scanner_correction import clock_from_document, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.geometry.se3 import as_transform
@@ -27,11 +27,10 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.robots import get_robot, stated_flange
 
-BAND_M = 0.02
-"""A point so near to the robot's surface belongs to the robot: a choice, twice a calibration by a tape measure."""
-_NO_JOINTS = "The scans have no joint angles (q1, q2 ...)"
+BAND_M = 0.02  # a choice, twice what a calibration by a tape measure leaves
+"""A point so near to the robot's surface belongs to the robot."""
 _SCALES_MM = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 1e3 * BAND_M)  # a choice: read at once
-_OFF_MM = 1.0  # of the flange by joints from its recorded pose: a choice, above what a factory calibration leaves
+_NO_JOINTS = "The scans have no joint angles (q1, q2 ...)"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,26 +40,20 @@ class Overlay:
     Attributes:
         scan: its id.
         X_BC: pose of the scanner when it was taken.
-        points_C, points_B: its measured points (N, 3) m, in the camera and in the base.
+        points_B: its measured points (N, 3) m in the base.
         distance: (N,) m from the nearest body, negative inside a closed mesh; NaN where it is above BAND_M.
         body: (N,) index of that body, -1 for none.
-        bodies: the links, and the flange.
-        notes: sentences for the user.
+        bodies: the links, the flange, and the target of a scanner on the flange.
+        note: a sentence for the user on what is compared.
     """
 
     scan: str
     X_BC: RigidTransform
-    points_C: Array
     points_B: Array
     distance: Array
     body: NDArray[np.intp]
-    bodies: tuple[BodyShape, ...]
-    notes: tuple[str, ...] = ()
-
-    @property
-    def on_robot(self) -> NDArray[np.bool_]:
-        """(N,) whether a point belongs to the robot."""
-        return self.body >= 0
+    bodies: Sequence[BodyShape]
+    note: str = ""
 
     @property
     def scale_mm(self) -> float:
@@ -69,14 +62,13 @@ class Overlay:
 
     @cached_property
     def rows(self) -> dict[str, dict[str, float]]:
-        """Statistics of the whole robot and of each body with points: how many, |distance| and the signed median, mm."""
-        chosen = {"robot": self.on_robot} | {body.name: self.body == k for k, body in enumerate(self.bodies)}
-        return {name: _row(1e3 * self.distance[mask]) for name, mask in chosen.items() if mask.any()}
-
-
-def _row(mm: Array) -> dict[str, float]:
-    median, p95 = np.percentile(np.abs(mm), [50, 95])
-    return {"points": len(mm), "median_mm": float(median), "p95_mm": float(p95), "signed_mm": float(np.median(mm))}
+        """Statistics of all bodies ("robot") and of each: points, median and 95 % of |distance|, signed median; mm."""
+        found = {}
+        masks = {"robot": self.body >= 0} | {body.name: self.body == k for k, body in enumerate(self.bodies)}
+        for name, mm in ((name, 1e3 * self.distance[mask]) for name, mask in masks.items() if mask.any()):
+            values = (len(mm), *np.percentile(np.abs(mm), [50, 95]).tolist(), float(np.median(mm)))
+            found[name] = dict(zip(("points", "median_mm", "p95_mm", "signed_mm"), values, strict=True))
+        return found
 
 
 def compare(points_B: Array, bodies: Sequence[BodyShape]) -> tuple[Array, NDArray[np.intp]]:
@@ -85,10 +77,8 @@ def compare(points_B: Array, bodies: Sequence[BodyShape]) -> tuple[Array, NDArra
     Where bodies overlap, the surface is that of their union.
     """
     every = np.array([body.distances(points_B, BAND_M) for body in bodies])
-    body = np.argmin(every, axis=0)
-    distance = every[body, np.arange(len(points_B))]
-    near = np.abs(distance) <= BAND_M
-    return np.where(near, distance, np.nan), np.where(near, body, -1)
+    near = np.abs(every.min(axis=0)) <= BAND_M
+    return np.where(near, every.min(axis=0), np.nan), np.where(near, np.argmin(every, axis=0), -1)
 
 
 def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | None = None) -> Overlay:
@@ -100,107 +90,70 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
     Raises:
         InputError: a file cannot be used, no such scan, or no point of it belongs to the robot.
     """
-    X, in_hand, own = _camera(result, dataset)
-    header = dataset / "dataset.yaml"
-    moving = header.is_file() and read_header(header).mode == "motion"
-    data = load_motion_dataset(dataset, robot=robot) if moving else load_dataset(dataset, carried=True)
-    mounting, pose = data.header.configuration, "X_FC" if in_hand else "X_BC"
-    if mounting not in CONFIGURATIONS or in_hand != (mounting == IN_HAND):
-        raise InputError(f"'{dataset.name}' has scans of {mounting}, and '{result}' holds {pose}: give its own result.")
-    if not data.clouds:
-        raise InputError(f"'{dataset.name}' has no scans, only centres: give a dataset with clouds/.")
-    ids = list(data.clouds)
-    id = scan or ids[0]
-    if id not in data.clouds:
-        listed = f"its scans go from {ids[0]} to {ids[-1]}."
-        raise InputError(f"'{dataset.name}' has no scan '{id}': {did_you_mean(id, ids, listed)}")
-    name = robot or data.header.robot or str(own.get("robot") or "")
-    name = name if is_urdf(name) else get_robot(name).name
-    file = own.get("kinematics_file")
-    kinematics = (result if result.is_dir() else result.parent) / file if file else None
-    X_BF, q = _in_motion(data, id, own) if isinstance(data, MotionDataset) else _at_rest(data, id, name)
-    links, notes = _links(name, q, kinematics)
-    if q is None and robot is not None:
-        raise InputError(f"{_NO_JOINTS}, by which --robot places the links: add them, or omit --robot.")
-    if q is not None:
-        by_joints = chain_forward(load_chain(name, kinematics), q)
-        off = 1e3 * float(np.linalg.norm(by_joints.translation() - X_BF.translation()))
-        X_BF = X_BF if kinematics is None else by_joints  # as in that calibration
-        if kinematics is None and off > _OFF_MM:
-            notes.append(f"The joint angles put the flange {off:.1f} mm from its recorded pose.")
-    standard = stated_flange(data.header.flange, name)
-    ring = flange_mesh(standard)
-    bodies = [*links, BodyShape("flange", X_BF if in_hand else X_BF @ data.X_FR, (ring,))]
-    if isinstance(seen := own.get("target"), dict):
-        R = RotationMatrix.MakeFromOneVector(np.array(seen["normal"], dtype=float), 2)
-        bodies.append(BodyShape("target", RigidTransform(R, seen["xyz"]), (flange_mesh(standard, holes=False),)))
-    opened = ", ".join(body.name for body in bodies if not body.closed)
-    if opened:
-        notes.append(f"The meshes of {opened} are not closed: their distances have no sign.")
-    correction = correction_from_document(own.get("scanner_correction"))
-    points_C = data.cloud(id).reshape(-1, 3)
-    points_C = points_C[np.isfinite(points_C).all(axis=1)]
-    points_C = points_C if correction is None else correction.points(points_C)
-    X_BC = X_BF @ X if in_hand else X
-    points_B = X_BC.multiply(points_C.T).T
-    distance, body = compare(points_B, bodies)
-    if (body < 0).all():
-        raise InputError(
-            f"No point of scan '{id}' lies within {1e3 * BAND_M:.0f} mm of the robot: check that '{result}' belongs to"
-            " this dataset, or take a scan that shows the robot."
-        )
-    return Overlay(
-        scan=id,
-        X_BC=X_BC,
-        points_C=points_C,
-        points_B=points_B,
-        distance=distance,
-        body=body,
-        bodies=tuple(bodies),
-        notes=tuple(notes),
-    )
-
-
-def _camera(result: Path, dataset: Path) -> tuple[RigidTransform, bool, Mapping[str, Any]]:
-    """Return the camera's pose, whether it is on the flange, and what calibration.yaml states beside it."""
-    files = [result / name for name in (HAND_EYE_FILE, RESULT_FILE)] if result.is_dir() else [result]
-    file = next((one for one in files if one.is_file()), None)
-    if file is None:
+    file = result / RESULT_FILE if result.is_dir() else result
+    if not file.is_file() and not (result / HAND_EYE_FILE).is_file():
         raise InputError(
             f"There is no calibration in '{result}': run 'weldcal calibrate {dataset} --out {result}' first."
         )
-    given = read_stated_pose(file)
-    own = read_document(file) if file.name == RESULT_FILE else {}
-    own = own if isinstance(own, Mapping) else {}
-    return as_transform(given.readings[0].X), given.mounting == IN_HAND, own
-
-
-def _at_rest(data: Dataset, id: str, name: str) -> tuple[RigidTransform, Array | None]:
-    """Return X_BF of a scan at rest, and its joint angles, None where none are recorded."""
-    q = joint_angles(data, [id], load_chain(name).n)
-    return data.poses[id], None if q is None else q[0]
+    given, own = read_stated_pose(result), read_document(file) if file.name == RESULT_FILE and file.is_file() else {}
+    X, header = as_transform(given.readings[0].X), dataset / "dataset.yaml"
+    moving = header.is_file() and read_header(header).mode == "motion"
+    data = load_motion_dataset(dataset, robot=robot) if moving else load_dataset(dataset, carried=True)
+    if data.header.configuration not in {given.mounting or ON_BASE} & {ON_BASE, IN_HAND}:
+        mountings = f"of {data.header.configuration}, and '{result}' is of {given.mounting or ON_BASE}"
+        raise InputError(f"'{dataset.name}' has scans {mountings}: give the result of this dataset.")
+    if (id := scan or next(iter(data.clouds), "")) not in data.clouds:
+        listed = f"it has {', '.join(list(data.clouds)[:8])}{' ...' if len(data.clouds) > 8 else ''}."
+        raise InputError(f"'{dataset.name}' has no scan '{id}': {did_you_mean(id, data.clouds, listed)}")
+    name = robot or data.header.robot or str(own.get("robot") or "")
+    name = name if is_urdf(name) else get_robot(name).name
+    kinematics = file.parent / own["kinematics_file"] if own.get("kinematics_file") else None
+    if isinstance(data, MotionDataset):
+        X_BF, q = _in_motion(data, id, own)
+    else:
+        angles = joint_angles(data, [id], load_chain(name).n)
+        X_BF, q = data.poses[id], None if angles is None else angles[0]
+    if q is None and robot is not None:
+        raise InputError(f"{_NO_JOINTS}, by which --robot places the links: add them, or omit --robot.")
+    bodies, note = _links(name, q, kinematics)
+    if q is not None and kinematics is not None:
+        X_BF = chain_forward(load_chain(name, kinematics), q)  # as in that calibration
+    standard, in_hand = stated_flange(data.header.flange, name), data.header.configuration == IN_HAND
+    bodies.append(BodyShape("flange", X_BF if in_hand else X_BF @ data.X_FR, [flange_mesh(standard)]))
+    if isinstance(seen := own.get("target"), Mapping):
+        X_BT = RigidTransform(RotationMatrix.MakeFromOneVector(np.array(seen["normal"]), 2), seen["xyz"])
+        bodies.append(BodyShape("target", X_BT, [flange_mesh(standard, holes=False)]))
+    correction, points = correction_from_document(own.get("scanner_correction")), data.cloud(id).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    X_BC = X_BF @ X if in_hand else X
+    points_B = X_BC.multiply((points if correction is None else correction.points(points)).T).T
+    distance, body = compare(points_B, bodies)
+    if (body < 0).all():
+        where = f"within {1e3 * BAND_M:.0f} mm of the robot"
+        raise InputError(f"No point of scan '{id}' lies {where}: check that '{result}' belongs to '{dataset}'.")
+    return Overlay(scan=id, X_BC=X_BC, points_B=points_B, distance=distance, body=body, bodies=bodies, note=note)
 
 
 def _in_motion(data: MotionDataset, id: str, own: Mapping[str, Any]) -> tuple[RigidTransform, Array | None]:
     """Return X_BF at the capture of a frame by the calibration's clock, and the joint angles then."""
-    clock = clock_from_document(own.get("clock"), RESULT_FILE)
-    frame = next(one for one in data.frames if one.id == id)
+    clock, frame = clock_from_document(own.get("clock"), RESULT_FILE), next(one for one in data.frames if one.id == id)
     time = None if clock is None else clock.capture(frame.arrival, frame.device)
     pose = ContinuousMotion(data.stream).poses(np.array([np.nan if time is None else time]))[0]
     if time is None or not np.isfinite(pose).all():
-        why = "the result states no clock" if time is None else "the robot's stream has no data at its capture"
-        raise InputError(f"Where the robot was at scan '{id}' is not known: {why}. Calibrate '{data.folder}' first.")
+        raise InputError(
+            f"The result states no capture time of scan '{id}': run 'weldcal calibrate {data.folder}' first."
+        )
     q = data.stream.joints
     return as_transform(pose), None if q is None else np.array([np.interp(time, data.stream.time, c) for c in q.T])
 
 
-def _links(name: str, q: Array | None, kinematics: Path | None) -> tuple[list[BodyShape], list[str]]:
+def _links(name: str, q: Array | None, kinematics: Path | None) -> tuple[list[BodyShape], str]:
     """Return the links of a robot as far as its shape and joints are known, with a sentence on their shape."""
     if q is None:
-        return [], [f"{_NO_JOINTS}: only the flange is compared."]
+        return [], f"{_NO_JOINTS}: only the flange is compared."
     if is_urdf(name):
-        return urdf_shape(Path(name), q), []
+        return urdf_shape(Path(name), q), ""
     if name not in known_arms():
-        return [], [f"The shape of the {name} is not known, so only the flange is compared: give --robot FILE.urdf."]
+        return [], f"The shape of the {name} is not known, so only the flange is compared: give --robot FILE.urdf."
     note = "The links are cylinders of the published radii: give --robot FILE.urdf for the maker's meshes."
-    return arm_shape(load_arm(name, kinematics), q), [note]
+    return arm_shape(load_arm(name, kinematics), q), note

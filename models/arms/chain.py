@@ -1,6 +1,7 @@
 """A serial arm of revolute joints, of our files or a URDF: forward and inverse kinematics, and Jacobian."""
 
 import xml.etree.ElementTree as ET
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -207,7 +208,7 @@ def read_urdf_chain(path: Path) -> Chain:
     Raises:
         InputError: the file cannot be read, or is no serial arm of revolute joints.
     """
-    plant, bodies, above = _parsed(path)
+    _, plant, bodies, above = _parsed(path)
     base, flange = _base(bodies, above), _flange(path, bodies, above)
     joints = _between(path, base, flange, above)
     context = plant.CreateDefaultContext()
@@ -237,21 +238,16 @@ def read_urdf_chain(path: Path) -> Chain:
     )
 
 
-def read_robot(path: Path) -> ET.Element:
-    """Return the XML of a URDF file. Raises InputError where it is none."""
+def _parsed(path: Path) -> tuple[ET.Element, Any, dict[str, Any], dict[str, Any]]:
+    """Return a URDF, Drake's plant of it without its pictures, its bodies and the joint above each, by name."""
     try:
         robot = ET.fromstring(read_text(path, LARGEST_DOCUMENT))
     except ET.ParseError as error:
         raise InputError(f"'{path.name}' is not XML: {error}; make a URDF of a xacro file with xacro first.") from error
     if robot.tag != "robot" or any("xacro" in (e.tag if isinstance(e.tag, str) else "") for e in robot.iter()):
         raise InputError(f"'{path.name}' is no URDF: make one of a xacro file with xacro first.")
-    return robot
-
-
-def _parsed(path: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """Return Drake's plant of a URDF without its pictures, its bodies and the joint above each, by name."""
-    robot = read_robot(path)
-    for link in robot.iter("link"):
+    bare = deepcopy(robot)
+    for link in bare.iter("link"):
         for picture in [e for e in link if e.tag in PICTURES]:
             link.remove(picture)  # kinematics needs no meshes, whose files may not be here
     # Drake's parser takes a third of a second to import
@@ -260,7 +256,7 @@ def _parsed(path: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
 
     plant = MultibodyPlant(time_step=0.0)
     try:
-        (model,) = Parser(plant).AddModelsFromString(ET.tostring(robot, encoding="unicode"), "urdf")
+        (model,) = Parser(plant).AddModelsFromString(ET.tostring(bare, encoding="unicode"), "urdf")
         above = {plant.get_joint(i).child_body().name(): plant.get_joint(i) for i in plant.GetJointIndices(model)}
         bodies = {plant.get_body(i).name(): plant.get_body(i) for i in plant.GetBodyIndices(model)}
         for name in bodies.keys() - above.keys():
@@ -268,25 +264,24 @@ def _parsed(path: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
         plant.Finalize()
     except Exception as error:  # Drake raises RuntimeError for most, and other types
         raise InputError(f"'{path.name}' cannot be read as a URDF: {' '.join(str(error).split())[:200]}") from error
-    return plant, bodies, above
+    return robot, plant, bodies, above
 
 
-def urdf_link_poses(path: Path, q: ArrayLike) -> dict[str, RigidTransform]:
-    """Poses X_BL of all links of a URDF file by name, at the joint angles q (n,) rad of its chain, the others at zero.
+def urdf_links(path: Path, q: ArrayLike) -> list[tuple[ET.Element, RigidTransform]]:
+    """All links of a URDF file with their poses X_BL, at the angles q (n,) rad of its chain, other joints at zero.
 
     Raises InputError: see read_urdf_chain, or another number of angles.
     """
-    plant, bodies, above = _parsed(path)
-    base = _base(bodies, above)
-    joints, angles = _between(path, base, _flange(path, bodies, above), above), np.asarray(q, dtype=float)
+    robot, plant, bodies, above = _parsed(path)
+    base, angles = _base(bodies, above), np.asarray(q, dtype=float)
+    joints, context = _between(path, base, _flange(path, bodies, above), above), plant.CreateDefaultContext()
     if len(joints) != len(angles):
         raise InputError(f"'{path.name}' has {len(joints)} joints from base to flange, and {len(angles)} are given.")
-    context = plant.CreateDefaultContext()
     plant.SetPositions(context, np.zeros(plant.num_positions()))
     for joint, angle in zip(joints, angles, strict=True):
         joint.set_angle(context, angle)
-    X_WB = bodies[base].EvalPoseInWorld(context)
-    return {name: X_WB.InvertAndCompose(body.EvalPoseInWorld(context)) for name, body in bodies.items()}
+    X_BW = bodies[base].EvalPoseInWorld(context).inverse()
+    return [(e, X_BW @ bodies[e.get("name", "")].EvalPoseInWorld(context)) for e in robot.iter("link")]
 
 
 def _base(bodies: dict[str, Any], above: dict[str, Any]) -> str:

@@ -195,8 +195,8 @@ def urdf(folder: Path) -> str:
 def test_a_right_calibration_shows_the_noise_only(scene: tuple[Path, Array, Array], tmp_path: Path) -> None:
     folder, owner, _ = scene
     found = overlay(write_result(tmp_path / "right", X_BC), folder / "data", "a", urdf(folder))
-    assert found.notes == ()
-    assert (found.on_robot == (owner >= 0)).mean() > 0.999
+    assert found.note == ""
+    assert ((found.body >= 0) == (owner >= 0)).mean() > 0.999
     assert [body.name for body in found.bodies] == ["base", *LINKS, "flange"]
     for k, name in enumerate(("base", *LINKS)):
         row = found.rows[name]
@@ -232,7 +232,9 @@ def test_a_scanner_on_the_flange_sees_the_base(scene: tuple[Path, Array, Array],
     found = overlay(write_result(tmp_path / "r", np.linalg.inv(X_BF) @ X_BC, "X_FC"), data, None, urdf(folder))
     assert found.rows["base"]["points"] == pytest.approx((owner == 0).sum(), rel=0.03)
     assert found.rows["robot"]["p95_mm"] < 0.25
-    with pytest.raises(InputError, match=r"has scans of eye_in_hand, and .* holds X_BC: give its own result"):
+    with pytest.raises(
+        InputError, match=r"scans of eye_in_hand, and .* is of eye_on_base: give the result of this dataset"
+    ):
         overlay(write_result(tmp_path / "other", X_BC), data, None, urdf(folder))
 
 
@@ -305,13 +307,13 @@ def test_the_command_writes_a_page_and_a_picture(
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ("no_scan", "has no scan 'b': its scans go from a to a."),
+        ("no_scan", "has no scan 'b': it has a."),
         ("no_result", "There is no calibration in '"),
         (
             "no_joints",
             "The scans have no joint angles (q1, q2 ...), by which --robot places the links: add them, or omit --robot.",
         ),
-        ("no_mesh", "has no mesh of 'two' that can be read: put the files that it names beside it, as STL, OBJ, PLY."),
+        ("no_mesh", "has no mesh of 'two' that can be read: put STL, OBJ or PLY files beside it, by the names in it."),
         ("no_robot", "Robot '' is not known"),
         ("elsewhere", "No point of scan 'a' lies within 20 mm of the robot"),
         ("no_dataset", "--scan, --robot and --out are for a scan: give its dataset after the result."),

@@ -193,9 +193,20 @@ def view(
     With DATASET: a scan in the base by RESULT, each point coloured by its distance from the robot's surface.
     """
     if dataset is not None:
-        return _view_scan(call, result, dataset, scan, robot, browser)
-    if scan or robot or call.out:
+        pages, more, values = _scan_pages(call, result, dataset, scan, robot)
+    elif scan or robot or call.out:
         raise InputError("--scan, --robot and --out are for a scan: give its dataset after the result.")
+    else:
+        pages, more, values = *_run_pages(result), None
+    opened = browser and open_pages(pages)
+    if browser and not opened:
+        console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
+    text = None if values else "\n".join(map(str, pages))
+    return Outcome({"state": "done", "pages": pages, "opened": opened} | more, values=values, text=text)
+
+
+def _run_pages(result: Path) -> tuple[list[Path], dict[str, object]]:
+    """Return the pages of a finished run, and a note on a killed one."""
     note = killed_weld(result) if result.is_dir() else ""
     if note and not any((result / name).exists() for name in PAGES):
         raise InputError(note)
@@ -203,11 +214,31 @@ def view(
     pages = [(result / RECORD_HTML).resolve()] if killed else find_pages(result)
     if note:
         console.emit_warning(note)
-    opened = _opened(pages, browser)
-    return Outcome(
-        {"state": "done", "pages": pages, "opened": opened} | ({"note": note} if note else {}),
-        text="\n".join(map(str, pages)),
-    )
+    return pages, {"note": note} if note else {}
+
+
+def _scan_pages(
+    call: Call, result: Path, dataset: Path, scan: str | None, robot: str | None
+) -> tuple[list[Path], dict[str, object], dict[str, object]]:
+    """Write overlay.html and overlay.png of a scan; the page, and its distances for JSON and as rows."""
+    # only here: another view needs none of these
+    from weldcal.calibration.recorded_overlay import overlay
+    from weldcal.tools.dashboard.recording import scan_page
+    from weldcal.tools.report.pictures import overlay_picture
+
+    call.progress("distances from the robot", 0.0)
+    found = overlay(result, dataset, scan, robot)
+    call.progress("picture and page", 0.7)
+    out = call.folder("view", f"{dataset.resolve().name}-{found.scan}").resolve()
+    write_atomic(out / "overlay.png", overlay_picture(found))
+    write_atomic(out / "overlay.html", scan_page(found))
+    if found.note:
+        console.emit_warning(found.note)
+    line = "{points} points; median {median_mm:.2f}, 95 % {p95_mm:.2f}, signed median {signed_mm:+.2f} mm"
+    rows = {name: line.format(**row) for name, row in found.rows.items()}
+    told = {"scan": found.scan, "points": len(found.body), "picture": out / "overlay.png"}
+    page = out / "overlay.html"
+    return [page], {**told, "bodies": found.rows, "note": found.note}, {**told, **rows, "page": page}
 
 
 def find_pages(result: Path) -> list[Path]:
@@ -226,47 +257,6 @@ def find_pages(result: Path) -> list[Path]:
             f"{result} holds neither report.html nor recording.html. Give the result folder of a finished run."
         )
     return pages
-
-
-def _view_scan(call: Call, result: Path, dataset: Path, scan: str | None, robot: str | None, browser: bool) -> Outcome:
-    """Write overlay.html and overlay.png of one scan, and print its distances."""
-    # only here: another view needs none of these
-    from weldcal.calibration.recorded_overlay import BAND_M, overlay
-    from weldcal.tools.dashboard.recording import scan_page
-    from weldcal.tools.report.pictures import overlay_picture
-
-    call.progress("distances from the robot", 0.0)
-    found = overlay(result, dataset, scan, robot)
-    call.progress("picture and page", 0.7)
-    out = call.folder("view", f"{dataset.resolve().name}-{found.scan}")
-    page, picture = (out.resolve() / f"overlay.{form}" for form in ("html", "png"))
-    write_atomic(picture, overlay_picture(found))
-    write_atomic(page, scan_page(found))
-    for note in found.notes:
-        console.emit_warning(note)
-    rows, measured = found.rows, len(found.points_B)
-    texts = {
-        name: f"{r['points']} points; median {r['median_mm']:.2f}, 95 % {r['p95_mm']:.2f} mm; signed"
-        f" {r['signed_mm']:+.2f} mm"
-        for name, r in rows.items()
-    }
-    values = {
-        "scan": f"{found.scan}: {rows['robot']['points']} of {measured} points within {1e3 * BAND_M:g} mm of the robot",
-        **texts,
-        "page": str(page),
-        "picture": str(picture),
-    }
-    summary = {"scan": found.scan, "points": measured, "bodies": rows, "notes": found.notes}
-    opened = _opened([page], browser)
-    return Outcome({"state": "done", **summary, "pages": [page], "picture": picture, "opened": opened}, values=values)
-
-
-def _opened(pages: list[Path], browser: bool) -> bool:
-    """Open the pages where that is wanted, with a warning where it is not possible."""
-    opened = browser and open_pages(pages)
-    if browser and not opened:
-        console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
-    return opened
 
 
 def open_pages(pages: list[Path]) -> bool:

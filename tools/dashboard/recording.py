@@ -17,14 +17,21 @@ from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.systems.viewer.cameras import CAMERAS, ZOOM
 from weldcal.systems.viewer.live import LiveView
-from weldcal.systems.viewer.scene import RESIDUAL_MM, coloured, diverging, draw_mesh, legend, set_the_scene
+from weldcal.systems.viewer.scene import RESIDUAL_MM, coloured, draw_mesh, legend, set_the_scene
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.values import scan_rows, weld_rows
+from weldcal.tools.report.pictures import overlay_colours
 
 _PAGE = Path(__file__).parent / "page"
-_ROBOT, _ELSEWHERE, _BACKGROUND = Rgba(0.62, 0.66, 0.70, 0.25), Rgba(0.45, 0.48, 0.52, 1.0), [0.20, 0.22, 0.25]
-_COLUMNS = "<th>part<th>points<th>median, unsigned<th>95 %, unsigned<th>median, signed"
-_POINTS, _POINT_M = 150_000, 0.0012  # a choice: some megabytes, and no gaps at a pixel of 1 mm
+_ROBOT = Rgba(0.62, 0.66, 0.70, 0.25)
+_ROW = "<td>{points}<td>{median_mm:.2f}<td>{p95_mm:.2f}<td>{signed_mm:+.2f}"
+_SCAN = (
+    "<div id=w-top><strong>Scan {scan}: distance, mm</strong><table cellpadding=3><tr><th>part<th>points<th>median"
+    "<th>95 %<th>signed median<tr><td>{rows}</table></div><div id=w-keys><div class=scale>distance from the robot's"
+    " surface<i></i><span class=ends><span>inside {limit:g} mm</span><span>0</span><span>{limit:g} mm outside</span>"
+    "</span></div><div>grey: not on the robot (over {band:g} mm)</div></div>"
+)
+_POINTS, _POINT_M = 300_000, 0.0012  # a choice: some megabytes, and no gaps at a pixel of 1 mm
 _ROWS = 1500  # of the weld, in the page
 
 
@@ -45,34 +52,22 @@ def _style() -> str:
 def scan_page(found: Overlay) -> str:
     """Return a page of Meshcat: the robot's shape in the base, and the scan's points on it by their distance."""
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
-    for body in found.bodies:
+    for n, body in enumerate(found.bodies):
         for k, mesh in enumerate(body.meshes):
-            draw_mesh(meshcat, f"/robot/{body.name}/{k}", mesh.vertices.T, mesh.triangles.T, _ROBOT)
-        meshcat.SetTransform(f"/robot/{body.name}", body.X_BL)
-    limit, on = found.scale_mm, found.on_robot
-    rng = np.random.default_rng(0)
-    others, own = (rng.permutation(np.flatnonzero(mask))[:_POINTS] for mask in (~on, on))
-    meshcat.SetObject("/scan/elsewhere", coloured(found.points_B[others]), _POINT_M, _ELSEWHERE)
-    colours = diverging(1e3 * found.distance[own] / limit)
-    meshcat.SetObject("/scan/on_robot", coloured(found.points_B[own], colours), _POINT_M)
-    middle = np.median(found.points_B[on], axis=0)
-    size = float(np.linalg.norm(np.ptp(found.points_B[on], axis=0)))
+            draw_mesh(meshcat, f"/robot/{n}/{k}", mesh.vertices.T, mesh.triangles.T, _ROBOT)
+        meshcat.SetTransform(f"/robot/{n}", body.X_BL)
+    drawn = np.random.default_rng(0).permutation(len(found.body))[:_POINTS]
+    meshcat.SetObject("/scan", coloured(found.points_B[drawn], overlay_colours(found)[drawn]), _POINT_M)
+    on = found.points_B[found.body >= 0]
+    middle, size = np.median(on, axis=0), float(np.linalg.norm(np.ptp(on, axis=0)))
     towards = found.X_BC.translation() - middle
     set_the_scene(meshcat, middle + 1.3 * size * towards / np.linalg.norm(towards), middle, RigidTransform())
-    meshcat.SetProperty("/Background", "top_color", _BACKGROUND)
-    meshcat.SetProperty("/Background", "bottom_color", _BACKGROUND)
-    rows = "".join(
-        f"<tr><td>{escape(name)}<td>{r['points']:.0f}<td>{r['median_mm']:.2f}<td>{r['p95_mm']:.2f}<td>{r['signed_mm']:+.2f}"
-        for name, r in found.rows.items()
-    )
+    for end in ("top_color", "bottom_color"):
+        meshcat.SetProperty("/Background", end, [0.20, 0.22, 0.25])
+    rows = [escape(name) + _ROW.format(**row) for name, row in found.rows.items()]
     head, end, tail = meshcat.StaticHtml().rpartition("</body>")
-    keys = (
-        f"<div class=scale>distance from the robot's surface<i></i><span class=ends><span>inside {limit:g} mm</span>"
-        f"<span>0</span><span>{limit:g} mm outside</span></span></div><div>grey: not on the robot (over"
-        f" {1e3 * BAND_M:g} mm)</div>"
-    )
-    top = f"<strong>Scan {escape(found.scan)}: distance, mm</strong><table cellpadding=3><tr>{_COLUMNS}</tr>{rows}</table>"
-    return f"{head}<style>{_style()}</style><div id=w-top>{top}</div><div id=w-keys>{keys}</div>{end}{tail}"
+    legend = _SCAN.format(scan=escape(found.scan), rows="<tr><td>".join(rows), limit=found.scale_mm, band=1e3 * BAND_M)
+    return f"{head}<style>{_style()}</style>{legend}{end}{tail}"
 
 
 def _told(cell: Cell[Any], run: Run[Any], live: LiveView, title: str) -> dict[str, Any]:

@@ -13,7 +13,8 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.colors import ListedColormap
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
@@ -111,7 +112,7 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
 MOST_SCANS = 48  # a choice: a page of eight rows; more would take megabytes and seconds
 _POINTS = 1500  # drawn a scan: a choice, dense at this size
 _INK = 5e4  # points of print squared that the dots of an overlay cover: about its half, a choice
-_DRAWN = 60_000  # of an overlay: a choice, more hide each other at this size
+_DRAWN = 200_000  # of an overlay: a choice, more hide each other at this size
 _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good scanner
 
 
@@ -141,29 +142,30 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
     return png(figure)
 
 
+def overlay_colours(found: Overlay) -> NDArray[np.uint8]:
+    """Colours (N, 3) RGB of a scan's points: by distance from the robot (blue: inside), others grey."""
+    share = 1e3 * np.nan_to_num(found.distance) / found.scale_mm
+    return np.where(found.body[:, None] < 0, np.uint8(115), diverging(share))
+
+
 def overlay_picture(found: Overlay) -> bytes:
-    """Draw a scan as the scanner sees it, its points on the robot by distance from the surface, and how many; PNG."""
-    limit, on = found.scale_mm, found.on_robot
-    distance = 1e3 * found.distance[on]
-    seen = 1e3 * found.points_C
-    figure, (left, right) = subplots(9.0, 4.6, 1, 2, width_ratios=[1.7, 1.0])
-    left.set_facecolor("#4a525a")  # the pale middle of the colours shows on it
+    """Draw a scan as the scanner sees it, its points on the robot by distance from the surface; PNG."""
+    limit, on, size = found.scale_mm, found.body >= 0, found.rows["robot"]
+    seen = 1e3 * found.X_BC.inverse().multiply(found.points_B.T)[:2]
+    figure, axes = subplots(8.2, 5.6)
+    axes.set_facecolor("#333840")  # the pale middle of the colours shows on it
+    drawn = np.random.default_rng(0).permutation(len(on))[:_DRAWN]
+    dot = min(9.0, _INK / np.count_nonzero(on[drawn]))
+    axes.scatter(*seen[:, drawn], c=overlay_colours(found)[drawn] / 255.0, s=dot, linewidths=0)
+    (left, top), (right, bottom) = np.percentile(seen[:, on], [0.1, 99.9], axis=1)
+    margin = 0.08 * max(right - left, bottom - top)
+    axes.set(xlim=(left - margin, right + margin), ylim=(bottom + margin, top - margin), aspect="equal")
+    lengths = "{points} points on it, median {median_mm:.2f}, 95 % {p95_mm:.2f}, signed median {signed_mm:+.2f} mm"
+    axes.set_title(f"scan {found.scan}, distance from the robot:\n{lengths.format(**size)}", fontsize=10, loc="left")
+    axes.set(xlabel="camera x, mm", ylabel="camera y, mm")
     colours = ListedColormap(diverging(np.linspace(-1.0, 1.0, 255)) / 255.0)
-    others, own = (np.random.default_rng(0).permutation(np.flatnonzero(mask))[:_DRAWN] for mask in (~on, on))
-    left.scatter(*seen[others, :2].T, c=GREY, s=0.3, linewidths=0)
-    dots = left.scatter(*seen[own, :2].T, c=1e3 * found.distance[own], cmap=colours, vmin=-limit, vmax=limit)
-    dots.set(sizes=[min(9.0, _INK / len(own))], linewidths=0)
-    low, high = np.percentile(seen[on, :2], [0.1, 99.9], axis=0)
-    margin = 0.08 * float((high - low).max())
-    left.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin), aspect="equal")
-    left.set(xlabel="camera x, mm", ylabel="camera y, mm", title=f"scan {found.scan}; light grey: not on the robot")
-    figure.colorbar(dots, ax=left, extend="both", label="distance from the surface, mm (below 0: inside)")
-    right.hist(np.clip(distance, -limit, limit), bins=60, range=(-limit, limit), color=OURS)
-    right.axvline(0.0, color="#444", linewidth=0.8)
-    plain(right, f"distance, mm (over {limit:g}: at its end)", "points")
-    size = found.rows["robot"]
-    lengths = f"median {size['median_mm']:.2f} mm, 95 % {size['p95_mm']:.2f} mm"
-    right.set_title(f"{size['points']} points on the robot, unsigned:\n{lengths}", fontsize=9, loc="left")
+    bar = ScalarMappable(Normalize(-limit, limit), colours)
+    figure.colorbar(bar, ax=axes, extend="both", label="mm from the surface (below 0: inside; grey: not on the robot)")
     return png(figure)
 
 
