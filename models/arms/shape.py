@@ -17,6 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 
 _MESHES = (".stl", ".obj", ".ply", ".gltf", ".glb")  # what Open3D reads; it reads no .dae
+_LARGEST_M = 5.0  # of a link: a choice, above any arm; more is millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,4 +78,6 @@ def _mesh(urdf: Path, picture: ET.Element) -> TriMesh | None:
     from weldcal.models.workpieces.mesh_files import read_surface  # only here: a known arm needs no files
 
     mesh, scale = read_surface(file, 1.0), np.array(named.get("scale", "1 1 1").split(), dtype=float)
+    if (size := float(np.ptp(mesh.vertices * scale, axis=0).max())) > _LARGEST_M:
+        raise InputError(f"'{file.name}' is {size:.0f} m wide: give it scale=\"0.001 0.001 0.001\" in '{urdf.name}'.")
     return placed_solid(picture, TriMesh(mesh.vertices * scale, mesh.triangles))

@@ -300,6 +300,7 @@ def test_the_command_writes_a_page_and_a_picture(
     text = browser.text()
     assert "Scan a: distance, mm" in text
     assert "inside 0.2 mm" in text
+    assert f"two\t{summary['bodies']['two']['points']}\t" in text
     assert browser.console_messages() == []
     assert browser.outside_addresses() == []
 
@@ -314,6 +315,7 @@ def test_the_command_writes_a_page_and_a_picture(
             "The scans have no joint angles (q1, q2 ...), by which --robot places the links: add them, or omit --robot.",
         ),
         ("no_mesh", "has no mesh of 'two' that can be read: put STL, OBJ or PLY files beside it, by the names in it."),
+        ("no_scale", "'one.stl' is 160 m wide: give it scale=\"0.001 0.001 0.001\" in 'arm.urdf'."),
         ("no_robot", "Robot '' is not known"),
         ("elsewhere", "No point of scan 'a' lies within 20 mm of the robot"),
         ("no_dataset", "--scan, --robot and --out are for a scan: give its dataset after the result."),
@@ -331,6 +333,9 @@ def test_a_mistake_is_one_sentence(
         data = write_scan(tmp_path / "data", cast(X_BC, 40)[0], q=np.array([]))
     if change == "no_mesh":
         (tmp_path / "mine" / "meshes" / "two.stl").unlink()
+    if change == "no_scale":
+        text = (tmp_path / "mine" / "arm.urdf").read_text()
+        (tmp_path / "mine" / "arm.urdf").write_text(text.replace('scale="0.001 0.001 0.001"', ""))
     words = [result, *([] if change == "no_dataset" else [data]), *([] if change == "no_robot" else robot)]
     refused = view(*words, "--scan", "b" if change == "no_scan" else "a", "--out", tmp_path / "out")
     assert refused.exit_code == 1, refused.stdout

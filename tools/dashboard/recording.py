@@ -24,10 +24,10 @@ from weldcal.tools.report.pictures import overlay_colours
 
 _PAGE = Path(__file__).parent / "page"
 _ROBOT = Rgba(0.62, 0.66, 0.70, 0.25)
-_ROW = "<td>{points}<td>{median_mm:.2f}<td>{p95_mm:.2f}<td>{signed_mm:+.2f}"
+_ROW = "<tr><td>{name}<td>{points}<td>{median_mm:.2f}<td>{p95_mm:.2f}<td>{signed_mm:+.2f}"
 _SCAN = (
     "<div id=w-top><strong>Scan {scan}: distance, mm</strong><table cellpadding=3><tr><th>part<th>points<th>median"
-    "<th>95 %<th>signed median<tr><td>{rows}</table></div><div id=w-keys><div class=scale>distance from the robot's"
+    "<th>95 %<th>signed median{rows}</table></div><div id=w-keys><div class=scale>distance from the robot's"
     " surface<i></i><span class=ends><span>inside {limit:g} mm</span><span>0</span><span>{limit:g} mm outside</span>"
     "</span></div><div>grey: not on the robot (over {band:g} mm)</div></div>"
 )
@@ -64,9 +64,9 @@ def scan_page(found: Overlay) -> str:
     set_the_scene(meshcat, middle + 1.3 * size * towards / np.linalg.norm(towards), middle, RigidTransform())
     for end in ("top_color", "bottom_color"):
         meshcat.SetProperty("/Background", end, [0.20, 0.22, 0.25])
-    rows = [escape(name) + _ROW.format(**row) for name, row in found.rows.items()]
+    rows = [_ROW.format(name=escape(name), **row) for name, row in found.rows.items()]
     head, end, tail = meshcat.StaticHtml().rpartition("</body>")
-    legend = _SCAN.format(scan=escape(found.scan), rows="<tr><td>".join(rows), limit=found.scale_mm, band=1e3 * BAND_M)
+    legend = _SCAN.format(scan=escape(found.scan), rows="".join(rows), limit=found.scale_mm, band=1e3 * BAND_M)
     return f"{head}<style>{_style()}</style>{legend}{end}{tail}"
 
 

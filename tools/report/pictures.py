@@ -145,15 +145,15 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
 def overlay_colours(found: Overlay) -> NDArray[np.uint8]:
     """Colours (N, 3) RGB of a scan's points: by distance from the robot (blue: inside), others grey."""
     share = 1e3 * np.nan_to_num(found.distance) / found.scale_mm
-    return np.where(found.body[:, None] < 0, np.uint8(115), diverging(share))
+    return np.where(found.body[:, None] < 0, np.uint8(70), diverging(share))
 
 
 def overlay_picture(found: Overlay) -> bytes:
     """Draw a scan as the scanner sees it, its points on the robot by distance from the surface; PNG."""
     limit, on, size = found.scale_mm, found.body >= 0, found.rows["robot"]
     seen = 1e3 * found.X_BC.inverse().multiply(found.points_B.T)[:2]
-    figure, axes = subplots(8.2, 5.6)
-    axes.set_facecolor("#333840")  # the pale middle of the colours shows on it
+    figure, axes = subplots(6.8, 5.6)
+    axes.set_facecolor("#22262b")  # the pale middle of the colours shows on it
     drawn = np.random.default_rng(0).permutation(len(on))[:_DRAWN]
     dot = min(9.0, _INK / np.count_nonzero(on[drawn]))
     axes.scatter(*seen[:, drawn], c=overlay_colours(found)[drawn] / 255.0, s=dot, linewidths=0)
