@@ -15,6 +15,7 @@ from weldcal.models.documents import read_document, read_part
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
 from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, ToolShape, WeldingTool
+from weldcal.models.tools.elastomers import MATERIALS, Elastomer
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 
@@ -50,6 +51,10 @@ class TipPart:
     damping_N_s_per_m: float = 3.0
     mass_kg: float = 0.005  # of what moves with the tip
     finger_radius_mm: float = 2.2  # of the drawn rod between tag and ball
+    material: str = ""  # tpu_85a, tpu_95a, silicone: its creep and its loss; empty: springs without memory
+    relaxation_s: float | None = None  # of the simulated tip, in place of the material's, as are the two shares
+    creep_share: float | None = None  # of the force of a fast press that relaxes
+    loss_share: float | None = None  # of the work of a slow press that does not return
 
 
 @dataclass
@@ -145,6 +150,8 @@ POSITIVE = (
     *("tag.membrane_mm", "finger_camera.focal_px", "finger_camera.width", "finger_camera.height"),
 )
 LEAST_CHORD_M = 0.010  # the servo steers by the line from torch to tip
+LEAST_RELAXATION_S = 0.02  # ten steps of the simulated plant
+MOST_SHARE = 0.6  # of creep or loss: the friction of the simulated tip would chatter beyond
 WELDING = Path(__file__).resolve().parent / "welding.yaml"
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 COLOURS = ("dark", "steel", "copper", "soft", "white")
@@ -212,6 +219,7 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         lateral_stiffness_N_per_m=tip.lateral_stiffness_N_per_mm * 1e3,
         axial_stiffness_N_per_m=tip.axial_stiffness_N_per_mm * 1e3,
         damping_N_s_per_m=tip.damping_N_s_per_m,
+        memory=_memory(path.name, tip),
         tip_reach_m=tip.xyz_mm[2] / 1e3,
         tag_reach_m=tag.xyz_mm[2] / 1e3,
         tag_size_m=tag.size_mm / 1e3 if finger is None or finger.tag_size_m is None else finger.tag_size_m,
@@ -314,6 +322,25 @@ def _check_sizes(file: str, part: ToolPart) -> None:
         raise InputError(
             f"'{file}': a point of the tool is {longest:.0f} mm from the flange; give millimetres in the flange frame."
         )
+
+
+def _memory(file: str, tip: TipPart) -> Elastomer | None:
+    """Return what the tip remembers, None where the file states nothing of it."""
+    if tip.material and tip.material not in MATERIALS:
+        raise InputError(f"'{file}': tip.material must be one of {', '.join(MATERIALS)}, not '{tip.material}'.")
+    keys = ("relaxation_s", "creep_share", "loss_share")
+    given = {key: value for key in keys if (value := getattr(tip, key)) is not None}
+    if not tip.material and not given:
+        return None
+    if not tip.material and len(given) < len(keys):
+        raise InputError(f"'{file}': tip needs {', '.join(keys)} together, or a material that gives the others.")
+    found = dc.replace(MATERIALS.get(tip.material, MATERIALS["silicone"]), **given)
+    if not found.relaxation_s >= LEAST_RELAXATION_S:
+        raise InputError(f"'{file}': tip.relaxation_s must be {LEAST_RELAXATION_S:g} s or more.")
+    for key in keys[1:]:
+        if not 0.0 <= getattr(found, key) <= MOST_SHARE:
+            raise InputError(f"'{file}': tip.{key} is a share from 0 to {MOST_SHARE:g}, not {getattr(found, key):g}.")
+    return found
 
 
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
