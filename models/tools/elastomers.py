@@ -6,6 +6,7 @@ from -1 to 1 with the direction of the motion, over TRANSITION_M: friction that 
 to the deflection. k is the constant after relaxation.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,15 @@ class Elastomer:
                 side + (z - side) * np.exp(-np.abs(moved) / TRANSITION_M),
             ]
         )
+
+    def free_s(self, press_m: float, zero_m: float) -> float:
+        """Return how long after a long press m a tip must be free until it is that near to its rest, m; in s.
+
+        A free tip is at x = c v with c = r / (1 + r - b), and v' = (x - v) / relaxation_s.
+        """
+        share = self.relaxing / (1.0 + self.relaxing - self.friction)
+        left = max(share * press_m / zero_m, 1.0)
+        return self.relaxation_s / (1.0 - share) * math.log(left)
 
     def rest(self, memory: Array, deflection_m: Array) -> Array:
         """Return where the springs (n,), k (1 + r) stiff, pull to, m: where a tip rests that nothing touches."""

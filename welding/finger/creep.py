@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -13,12 +14,13 @@ from weldcal.welding.numerics import Array
 FEWEST_ROWS = 40  # a choice: five for each of eight unknowns
 LEAST_PRESS_M = 0.5e-3  # a choice, as in calibrate_tip
 MOST_PRESS_M = 0.02  # a choice: no finger of this kind moves as far; more is another unit
+ALIKE_SPANS = 2.0  # a choice: largest ratio of indentation and deflection on a rigid plate
 SLOWEST_ROWS_S = 5.0  # a choice: between two rows of a table in s; more is another unit
 BACK = 0.5  # share of the largest indentation that the unloading must take back
 HELD = 1.5  # relaxation times that the table must last from the first press on
 SEEN = 3.0  # standard deviations from zero that an estimate needs to be one
 ALIKE = 0.35  # a choice: correlation of neighbouring residuals above which they are no noise
-_TIMES = 24  # starting relaxation times
+_TIMES = 12  # starting relaxation times
 _MOST = 0.9  # largest share that is searched
 
 
@@ -34,32 +36,32 @@ class LoadingEstimate:
         tip: relaxation time in s, share of the force that relaxes, share of a slow press's work that is lost.
         sigmas: (3,) of these, in the same order.
         stiffness_N_per_m: after relaxation; None without a force.
-        residual: rms of what the fit leaves, N or m.
+        residuals: rms of what the fit leaves, of the force in N, of the deflection in m, as far as given.
         concerns: sentences on what the cycle does not show.
     """
 
     tip: Elastomer
     sigmas: Array
     stiffness_N_per_m: float | None
-    residual: float
+    residuals: tuple[float, ...]
     concerns: tuple[str, ...]
 
 
-def response(unknowns: Array, time_s: Array, indentation_m: Array, tag: bool) -> Array:
-    """Return what a tip answers to an indentation (n,) m: the force, or with `tag` its deflection as the tag shows it.
+def response(unknowns: Array, time_s: Array, indentation_m: Array) -> tuple[Array, Array]:
+    """Return the force (n,) N and the deflection (n,) m of a tip that is pressed on a rigid plate.
 
-    `unknowns` (7,): stiffness N/m (with `tag` the contact's over the tip's), offset of the answer, log of the relaxation
-    time in s, r and b (see models/tools/elastomers), log of the deflection in m over which the friction turns, and the
-    spring's curvature in 1/m (not with `tag`). A plate cannot pull: a tip that would hang on it is free, and recovers.
+    `unknowns` (9,): log of the relaxation time in s, r and b (see models/tools/elastomers), log of the deflection in m
+    over which the friction turns, stiffness N/m, offset of the force N, curvature of the spring 1/m, what contact and
+    robot give way over the tip's deflection, offset of the deflection m. A plate cannot pull: a tip that would hang on
+    it is free, and recovers.
     """
-    stiffness, offset, log_time, relaxing, friction, log_turn, curvature = unknowns.tolist()
+    log_time, relaxing, friction, log_turn, stiffness, force_0, curvature, yielding, shown_0 = unknowns.tolist()
     time, moved = math.exp(log_time), np.diff(indentation_m, prepend=0.0)
     dt = np.diff(time_s, prepend=time_s[0] - 1.0)
     decays, turns = np.exp(-dt / time), np.exp(-np.abs(moved) / math.exp(log_turn))
     follows = time * (1.0 - decays) / dt
-    yielding = 1.0 / stiffness if tag else 0.0
     strain = lag = side = 0.0  # the lag is the strain less v
-    answer = np.empty(len(time_s))
+    found = np.empty((2, len(time_s)))
     steps = zip(indentation_m.tolist(), moved.tolist(), decays.tolist(), turns.tolist(), follows.tolist(), strict=True)
     for k, (u, way, decay, turn, follow) in enumerate(steps):
         base = lag * decay - follow * strain
@@ -71,57 +73,69 @@ def response(unknowns: Array, time_s: Array, indentation_m: Array, tag: bool) ->
         if force < 0.0 or u <= 0.0:
             force, held = 0.0, max(-relaxing * base / slope, 0.0)
         strain, lag = held, base + follow * held
-        answer[k] = held if tag else stiffness * force
-    return answer + offset
+        found[:, k] = force, held
+    return stiffness * found[0] + force_0, found[1] + shown_0
 
 
-def estimate_loading(time_s: Array, indentation_m: Array, answer: Array, tag: bool = False) -> LoadingEstimate:
+def estimate_loading(
+    time_s: Array, indentation_m: Array, force_N: Array | None = None, shown_m: Array | None = None
+) -> LoadingEstimate:
     """Estimate creep and loss from a cycle: the tip is pressed on a rigid plate, held, let go, and observed.
 
-    Least squares over `response`. The covariance is that of the fit, enlarged where its residuals vary together.
+    Least squares over `response`, each series weighted by what it leaves. The covariance is that of the fit, enlarged
+    where its residuals vary together.
 
     Args:
-        time_s: (n,); indentation_m: (n,), commanded, zero at contact; answer: (n,) N, the force, or with `tag` m, the
-        deflection that the tag shows.
+        time_s: (n,); indentation_m: (n,), commanded, zero at contact; force_N: (n,); shown_m: (n,), the deflection that
+        the tag shows. One of the two, or both: a force alone takes what contact and robot give way for the tip's.
 
     Raises:
         LoadingError: the table shows no unloading, is too short, or its times or units are wrong.
     """
-    _check(time_s, indentation_m)
+    _check(time_s, indentation_m, shown_m)
     u, deepest = indentation_m, int(np.argmax(indentation_m))
-    y = answer if answer[deepest] >= answer[0] else -answer  # a force of the tip on the plate
-    span, press = float(np.ptp(y)), float(np.ptp(u))
-    if not span > 0.0:
-        raise LoadingError("The tip's answer is the same in all rows: check the column of the force or the deflection.")
-    lasts = float(time_s[-1] - time_s[int(np.argmax(u > 0.1 * u.max()))])
+    press, lasts = float(np.ptp(u)), float(time_s[-1] - time_s[int(np.argmax(u > 0.1 * u.max()))])
     apart = float(np.median(np.diff(time_s)))
-    stiff = 10.0 if tag else span / press
-    low = [stiff / 100.0, y.min() - span, math.log(0.5 * apart), 0.0, 0.0, math.log(1e-6), -0.3 / press]
-    high = [stiff * 100.0, y.max() + span, math.log(20.0 * lasts), 9.0, _MOST, math.log(0.5 * press), 1.0 / press]
-    scale = np.array([0.3 * stiff, 0.1 * span, 0.3, 0.1, 0.1, 0.5, 0.1 / press])
-    free = np.array([True] * 6 + [not tag])
+    if force_N is not None and force_N[deepest] < force_N[0]:
+        force_N = -force_N  # of the tip on the plate
+    series = [y for y in (force_N, shown_m) if y is not None]
+    spans = [float(np.ptp(y)) for y in series]
+    if not series or min(spans) <= 0.0:
+        raise LoadingError("The tip's answer is the same in all rows: check the columns of force and deflection.")
+    forced, shown = force_N is not None, shown_m is not None
+    stiff, first = (spans[0] / press, float(series[0][0])) if forced else (1.0, 0.0)
+    free = np.array([True] * 4 + [forced, forced, forced and not shown, shown, shown])
+    low = np.array([math.log(0.5 * apart), 0.0, 0.0, math.log(1e-6), stiff / 99.0, -99.0, -0.3 / press, 0.0, -press])
+    high = np.array(
+        [math.log(20.0 * lasts), 9.0, _MOST, math.log(0.5 * press), 99.0 * stiff, 99.0, 1.0 / press, 3.0, press]
+    )
+    scale = np.array([0.3, 0.1, 0.1, 0.5, 0.3 * stiff, 0.1 * stiff * press, 0.1 / press, 0.1, 0.1 * press])
+    low[5], high[5] = first - spans[0], first + spans[0]
+    start = np.array([0.0, 0.0, 0.1, math.log(0.3 * TRANSITION_M), 0.8 * stiff, first, 0.0, 0.1 * shown, 0.0])
 
-    def whole(unknowns: Array) -> Array:
-        return np.concatenate([unknowns, np.zeros(7 - len(unknowns))])
+    def residuals(given: Array, weights: list[float]) -> Array:
+        unknowns = np.zeros(len(free))
+        unknowns[free] = given
+        found = response(unknowns, time_s, u)
+        pairs = zip((y for y, there in zip(found, (forced, shown), strict=True) if there), series, weights, strict=True)
+        return np.concatenate([(model - y) * weight for model, y, weight in pairs])
 
-    def residuals(unknowns: Array) -> Array:
-        return np.asarray((response(whole(unknowns), time_s, u, tag) - y) / span)
-
-    times = np.geomspace(2.0 * apart, lasts, _TIMES)
-    starts = [
-        np.array([0.8 * stiff, float(y[0]), math.log(t), r, 0.1, math.log(0.3 * TRANSITION_M), 0.0])[free]
-        for t in times
-        for r in (0.1, 0.3)
-    ]
-    start = min(starts, key=lambda found: float((residuals(found) ** 2).sum()))
-    bounds = (np.array(low)[free], np.array(high)[free])
-    fit = least_squares(residuals, start, bounds=bounds, x_scale=scale[free])
-    left, J = fit.fun, fit.jac * scale[free]
-    variance = float(left @ left) / (len(left) - int(free.sum())) * _correlated(left)
+    weights, starts = [1.0 / span for span in spans], []
+    for time, relaxing in product(np.geomspace(2.0 * apart, lasts, _TIMES), (0.1, 0.3)):
+        starts.append(np.r_[math.log(time), relaxing, start[2:]][free])
+    best = min(starts, key=lambda given: float((residuals(given, weights) ** 2).sum()))
+    for _ in range(2):
+        fit = least_squares(residuals, best, bounds=(low[free], high[free]), x_scale=scale[free], args=(weights,))
+        best, parts = fit.x, np.split(fit.fun, len(series))
+        left = [float(np.sqrt(np.mean(part**2))) / weight for part, weight in zip(parts, weights, strict=True)]
+        if len(series) == 1:
+            break
+        weights = [1.0 / max(rms, 1e-6 * span) for rms, span in zip(left, spans, strict=True)]
+    J, alike = fit.jac * scale[free], max(_correlated(part) for part in parts)
+    variance = float(fit.fun @ fit.fun) / (len(fit.fun) - int(free.sum())) * alike
     sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J, rcond=1e-12, hermitian=True)) * variance) * scale[free]
-    stiffness, _, log_time, relaxing, friction = (float(v) for v in fit.x[:5])
-    time = math.exp(log_time)
-    creeps = relaxing > SEEN * sigma[3]
+    time, relaxing, friction = math.exp(best[0]), float(best[1]), float(best[2])
+    creeps = relaxing > SEEN * sigma[1]
     if creeps and time > lasts / HELD:
         raise LoadingError(
             f"The cycle lasts {lasts:.1f} s, and the tip still creeps: its relaxation time is about {time:.0f} s. Hold"
@@ -129,18 +143,18 @@ def estimate_loading(time_s: Array, indentation_m: Array, answer: Array, tag: bo
         )
     if creeps and time < 2.0 * apart:
         raise LoadingError(f"The tip relaxes within {time:.2g} s, and the rows are {apart:.2g} s apart: record faster.")
-    concerns = []
-    if not creeps:
-        concerns.append("No creep is seen: the relaxation time stays open.")
-    if friction <= SEEN * sigma[4]:
+    concerns = [] if creeps else ["No creep is seen: the relaxation time stays open."]
+    if friction <= SEEN * sigma[2]:
         concerns.append("No loss is seen beyond creep.")
-    if float(left[1:] @ left[:-1]) > ALIKE * float(left @ left):
+    if not shown:
+        concerns.append("Without deflection_mm what contact and robot give way counts as the tip's.")
+    if max(float(part[1:] @ part[:-1]) / max(float(part @ part), 1e-30) for part in parts) > ALIKE:
         concerns.append("One relaxation time does not explain this cycle: the sigmas are of its best one.")
     return LoadingEstimate(
         tip=Elastomer(time, relaxing / (1.0 + relaxing), 2.0 * friction / (1.0 + friction)),
-        sigmas=np.array([time * sigma[2], sigma[3] / (1.0 + relaxing) ** 2, 2.0 * sigma[4] / (1.0 + friction) ** 2]),
-        stiffness_N_per_m=None if tag else stiffness,
-        residual=span * float(np.sqrt(np.mean(left**2))),
+        sigmas=np.array([time * sigma[0], sigma[1] / (1.0 + relaxing) ** 2, 2.0 * sigma[2] / (1.0 + friction) ** 2]),
+        stiffness_N_per_m=float(best[4]) if forced else None,
+        residuals=tuple(left),
         concerns=tuple(concerns),
     )
 
@@ -156,14 +170,14 @@ def _correlated(left: Array) -> float:
     return total
 
 
-def _check(time_s: Array, indentation_m: Array) -> None:
+def _check(time_s: Array, indentation_m: Array, shown_m: Array | None) -> None:
     """Raise LoadingError where the table cannot be a cycle of loading and unloading."""
     if len(time_s) < FEWEST_ROWS:
         raise LoadingError(f"The table has {len(time_s)} rows, and {FEWEST_ROWS} are needed: record faster.")
     if not (np.diff(time_s) > 0.0).all():
         k = int(np.argmax(np.diff(time_s) <= 0.0))
         raise LoadingError(
-            f"Time does not grow from row {k + 1} to row {k + 2} ({time_s[k]:g} s, {time_s[k + 1]:g} s): sort the table"
+            f"Time does not grow from row {k + 1} to row {k + 2} ({time_s[k]:g}, {time_s[k + 1]:g} s): sort the table"
             " and leave out what is there twice."
         )
     if float(np.median(np.diff(time_s))) > SLOWEST_ROWS_S:
@@ -180,6 +194,11 @@ def _check(time_s: Array, indentation_m: Array) -> None:
     back = (indentation_m[deepest] - indentation_m[deepest:].min()) / press
     if back < BACK:
         raise LoadingError(
-            f"The table has no unloading: after {time_s[deepest]:g} s the indentation falls by {100.0 * back:.0f} % only."
+            f"The table has no unloading: after {time_s[deepest]:.1f} s the indentation falls by {100.0 * back:.0f} % only."
             " Record until the tip is free."
+        )
+    if shown_m is not None and not 1.0 / ALIKE_SPANS <= np.ptp(shown_m) / press <= ALIKE_SPANS:
+        raise LoadingError(
+            f"The tag shows {1e3 * np.ptp(shown_m):g} mm for an indentation of {1e3 * press:g} mm: give both in"
+            " millimetres, along the same axis, pressed on a rigid plate."
         )

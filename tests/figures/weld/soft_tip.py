@@ -48,7 +48,12 @@ def rows(run: Run) -> Iterator[Row]:
         torch = [weld for weld, _ in welds]
         after = "first weld" if math.isinf(free_s) else f"{free_s:.0f} s after"
         yield (
-            *(f"{material or 'no memory'}, {after}", f"{speed:.0f}", fixed(float(felt[0]), 3), fixed(float(felt[1]), 3)),
+            *(
+                f"{material or 'no memory'}, {after}",
+                f"{speed:.0f}",
+                fixed(float(felt[0]), 3),
+                fixed(float(felt[1]), 3),
+            ),
             *(fixed(float(np.mean([w.mean_mm for w in torch])), 3), fixed(max(w.max_mm for w in torch), 2)),
             *(fixed(max(w.height_mm for w in torch), 2), f"{sum(w.completed for w in torch)} of {len(torch)}"),
         )

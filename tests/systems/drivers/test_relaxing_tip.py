@@ -43,7 +43,9 @@ def height(drive: Drive) -> float:
 def force(drive: Drive) -> float:
     """Force of the axial spring, N, upwards positive on the finger; the ball's weight is held too."""
     world = drive.station.world
-    return 9.81 * TOOL.tip_mass_kg / 3.0 - float(world.plant.get_net_actuation_output_port(world.tool).Eval(drive.plant)[2])
+    return 9.81 * TOOL.tip_mass_kg / 3.0 - float(
+        world.plant.get_net_actuation_output_port(world.tool).Eval(drive.plant)[2]
+    )
 
 
 def test_a_held_tip_relaxes_and_a_freed_one_recovers(tmp_path: Path) -> None:
