@@ -32,7 +32,8 @@ class LoadingTruth:
 def commanded(t: Lanes, press_m: float, speed_m_s: Lanes, hold_s: Lanes) -> Lanes:
     """Indentation m of a press at a speed, a hold, and the way back; then free."""
     up = press_m / speed_m_s
-    return np.clip(np.minimum(speed_m_s * t, press_m - speed_m_s * (t - up - hold_s)), 0.0, press_m)
+    indentation: Lanes = np.minimum(speed_m_s * t, press_m - speed_m_s * (t - up - hold_s)).clip(0.0, press_m)
+    return indentation
 
 
 def cycles(truth: LoadingTruth, press_m: float, speed_m_s: Lanes, hold_s: Lanes, rest_s: Lanes) -> np.ndarray:
@@ -48,7 +49,8 @@ def cycles(truth: LoadingTruth, press_m: float, speed_m_s: Lanes, hold_s: Lanes,
 
     def force(x: Lanes) -> Lanes:
         held = ((x[:, None] - slid) / truth.sliders_m).clip(-1.0, 1.0).mean(axis=1)
-        return truth.stiffness * x * (1.0 + b * held) + (springs * (x[:, None] - length)).sum(axis=1)
+        pull: Lanes = truth.stiffness * x * (1.0 + b * held) + (springs * (x[:, None] - length)).sum(axis=1)
+        return pull
 
     for i, indentation in enumerate(u):
         pressed = force(indentation) > 0.0
