@@ -31,6 +31,7 @@ from weldcal.models.files import (
     require_few_lines,
     sha256,
 )
+from weldcal.models.tools.own_ring import is_shape_file, own_ring
 
 Row = dict[str, str]
 Angles = dict[str, dict[str, float]]
@@ -199,6 +200,20 @@ def read_header(path: Path) -> DatasetHeader:
         )
     _check_poses(header, path)
     _check_clouds(header, path)
+    return _with_own_ring(header, path.parent)
+
+
+def _with_own_ring(header: DatasetHeader, folder: Path) -> DatasetHeader:
+    """Return the header with the ring of a part's file as its flange, where `flange` names such a file beside it.
+
+    `feature_in_flange` then states the pose of the file's frame, and becomes that of the ring. Raises InputError.
+    """
+    if is_shape_file(header.flange):
+        ring, given = own_ring(folder / header.flange), header.feature_in_flange
+        X_FR = RigidTransform(unit_quaternion(given.wxyz, "feature_in_flange"), given.xyz) @ ring.X_SR
+        quaternion = X_FR.rotation().ToQuaternion().wxyz()
+        header.flange = ring.name
+        header.feature_in_flange = Feature(X_FR.translation().tolist(), quaternion.tolist())
     return header
 
 

@@ -18,6 +18,7 @@ from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, Tool
 from weldcal.models.tools.elastomers import MATERIALS, Elastomer
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
+from weldcal.models.tools.own_ring import is_shape_file, own_ring
 
 Triple = tuple[float, float, float]
 
@@ -32,7 +33,8 @@ class RingPart:
         0.0,
         0.0,
     )  # its z out of the face; 180, 0, 0 looks back along the flange, at a scanner above
-    standard: str = ""  # its dimensions by name (tool-ring-63, iso9409-1-50-4-m6 ...); empty: outer_mm and bore_mm
+    # its dimensions by name (tool-ring-63, iso9409-1-50-4-m6 ...), or its STL or STEP file; empty: outer_mm and bore_mm
+    standard: str = ""
     outer_mm: float = 0.0  # outer diameter
     bore_mm: float = 0.0  # diameter of the bore
     thickness_mm: float = 8.0  # of the ring as it is drawn
@@ -232,12 +234,12 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         nozzle_radius_m=0.5 * part.torch.nozzle_mm / 1e3,
         mass_kg=part.mass_kg,
         centre_of_mass_m=_metres(part.centre_of_gravity_mm),
-        ring=None if part.ring is None else _ring(path.name, part.ring),
+        ring=None if part.ring is None else _ring(path, part.ring),
         ring_height_m=0.008 if part.ring is None else part.ring.thickness_mm / 1e3,
         finger_radius_m=tip.finger_radius_mm / 1e3,
         membrane_radius_m=0.5 * tag.membrane_mm / 1e3,
         tag_plate_m=tag.plate_mm / 1e3,
-        ring_pose=None if part.ring is None else _placed(part.ring.xyz_mm, part.ring.rpy_deg),
+        ring_pose=None if part.ring is None else _ring_pose(path, part.ring),
         tip_pose=Placed(_metres(tip.xyz_mm), (float(rpy[0]), float(rpy[1]), float(rpy[2]))),
         camera_pose=_placed(camera.xyz_mm, camera.rpy_deg),
         tag_pose=_placed(tag.xyz_mm, tag.rpy_deg),
@@ -370,7 +372,21 @@ def _tilt(R_FT: RotationMatrix, axis: Triple) -> float:
     return round(float(np.arctan2(x, -z)), 4)
 
 
-def _ring(file: str, part: RingPart) -> FlangeStandard:
+def _ring_pose(path: Path, part: RingPart) -> Placed:
+    """Return the ring's pose; of a part's file the stated pose is that of the file's frame."""
+    placed = _placed(part.xyz_mm, part.rpy_deg)
+    if not is_shape_file(part.standard):
+        return placed
+    X_FR = placed.pose @ own_ring(path.parent / part.standard).X_SR
+    x, y, z = X_FR.translation().tolist()
+    roll, pitch, yaw = RollPitchYaw(X_FR.rotation()).vector().tolist()
+    return Placed((x, y, z), (roll, pitch, yaw))
+
+
+def _ring(path: Path, part: RingPart) -> FlangeStandard:
+    file = path.name
+    if is_shape_file(part.standard):
+        return get_flange(own_ring(path.parent / part.standard).name)
     if part.standard:
         return get_flange(part.standard)
     if not 0.0 < part.bore_mm < part.outer_mm:
