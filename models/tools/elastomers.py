@@ -69,7 +69,7 @@ class Elastomer:
 
 
 # Compression set after 22 h at 23 C is the share of a held deflection that stays (ASTM D395B), Bayshore resilience the
-# share of an impact's work that returns (ASTM D2632); Covestro's data sheets state both: Texin 985 (85A) set 16 to 19 %;
+# share of an impact's work that returns (ASTM D2632); Covestro's data sheets state: Texin 985 (85A) set 16 to 19 %;
 # 245 (43D, about 95A) set 18 %, resilience 45 %; 255 (55D) set 20 %, resilience 40 %. A slow press loses less than an
 # impact; a printed soft sensor less than 6 % (Soft Robotics, 10.1089/soro.2021.0074). Creep of TPU follows a power of
 # time (Polymers 15:3770, 2023), so that no data sheet has one time: each time is a choice, of a weld's first seconds.

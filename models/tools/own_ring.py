@@ -59,7 +59,7 @@ def own_ring(path: Path) -> OwnRing:
     if not found:
         low, high = 1e3 * LEAST_RING_M, 1e3 * LARGEST_RING_M
         raise InputError(
-            f"'{path.name}' has no flat face between an outer circle of {low:.0f} to {high:.0f} mm and a bore of the same"
+            f"'{path.name}' has no flat face between an outer circle of {low:.0f} to {high:.0f} mm and a bore of one"
             " centre, and weldcal calibrates by such a ring only: give a part with one, or measure the flange."
         )
     upward = found if len(found) == 1 else [one for one in found if one[1] > ALONG]
@@ -67,8 +67,8 @@ def own_ring(path: Path) -> OwnRing:
     alike = [one for one in upward if one[0] > ALIKE * widest]
     if len(alike) != 1:
         raise InputError(
-            f"'{path.name}' has {len(found)} rings, and {len(alike) or 'none'} of the widest that look along z: turn the"
-            " part in its file so that the face that the scanner sees looks along z, and is the widest that does."
+            f"'{path.name}' has {len(found)} rings, and {len(alike) or 'none'} of the widest that look along z: turn"
+            " the part in its file so that the face that the scanner sees looks along z, and is the widest that does."
         )
     outer, _, bore, centre, z = alike[0]
     bevels = [r - outer for c, a, r in circles if outer < r < outer + BEVEL_M and _below(c, a, centre, z)]

@@ -182,7 +182,7 @@ def _check(time_s: Array, indentation_m: Array, shown_m: Array | None) -> None:
         )
     if float(np.median(np.diff(time_s))) > SLOWEST_ROWS_S:
         raise LoadingError(
-            f"The rows are {np.median(np.diff(time_s)):g} s apart: t_s is in seconds, and yours seem to be milliseconds."
+            f"The rows are {np.median(np.diff(time_s)):g} s apart: t_s is in seconds, yours seem to be milliseconds."
         )
     press = float(np.ptp(indentation_m))
     if not LEAST_PRESS_M <= press <= MOST_PRESS_M:
@@ -194,8 +194,8 @@ def _check(time_s: Array, indentation_m: Array, shown_m: Array | None) -> None:
     back = (indentation_m[deepest] - indentation_m[deepest:].min()) / press
     if back < BACK:
         raise LoadingError(
-            f"The table has no unloading: after {time_s[deepest]:.1f} s the indentation falls by {100.0 * back:.0f} % only."
-            " Record until the tip is free."
+            f"The table has no unloading: after {time_s[deepest]:.1f} s the indentation falls by {100.0 * back:.0f} %"
+            " only. Record until the tip is free."
         )
     if shown_m is not None and not 1.0 / ALIKE_SPANS <= np.ptp(shown_m) / press <= ALIKE_SPANS:
         raise LoadingError(

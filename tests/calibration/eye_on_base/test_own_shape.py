@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from tests.models.tools.test_tool_file import changed
 from tests.worlds.flange_frames import cast, facing
+from tests.worlds.parts.step_parts import cylinder, fused, less, write_step
 from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.header import DatasetHeader, Feature
 from weldcal.calibration.data.results import load_result
@@ -148,6 +149,17 @@ def test_a_tool_file_takes_a_part_with_its_pose(tmp_path: Path) -> None:
     assert tool.X_FR.rotation().matrix()[:, 2] == pytest.approx(X.rotation().matrix()[:, 2], abs=1e-5)
     assert tool.ring is not None
     assert tool.ring.outer_m == pytest.approx(2.0 * outer, abs=2e-5)
+
+
+def test_a_step_file_shows_its_ring(tmp_path: Path) -> None:
+    ring = less(
+        fused(cylinder((0, 0, 0), 60.0, 10.0), cylinder((0, 0, 5), 45.0, 20.0)), cylinder((0, 0, -1), 31.5, 40.0)
+    )
+    write_step(ring, tmp_path / "cap.step")
+    found = own_ring(tmp_path / "cap.step")
+    assert found.name == "ring-90.00-63.00-c0.00"
+    assert found.X_SR.translation() == pytest.approx([0.0, 0.0, 0.025], abs=1e-6)
+    assert found.X_SR.rotation().matrix()[2, 2] == pytest.approx(1.0, abs=1e-9)
 
 
 def test_a_part_without_a_ring_or_with_two_is_refused(tmp_path: Path) -> None:

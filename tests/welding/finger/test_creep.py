@@ -125,7 +125,7 @@ def plain() -> np.ndarray:
         (lambda t, u, f: (t[:39], u[:39], f[:39]), "has 39 rows, and 40 are needed"),
         (lambda t, u, f: (t[:250], u[:250], f[:250]), "no unloading: after 1.5 s the indentation falls by 0 % only"),
         (lambda t, u, f: (np.r_[t[:9], t[8:-1]], u, f), "Time does not grow from row 9 to row 10"),
-        (lambda t, u, f: (1e3 * t, u, f), "t_s is in seconds, and yours seem to be milliseconds"),
+        (lambda t, u, f: (1e3 * t, u, f), "t_s is in seconds, yours seem to be milliseconds"),
         (lambda t, u, f: (t, 1e-3 * u, f), "spans 0.003 mm: give indentation_mm in millimetres"),
         (lambda t, u, f: (t, 1e3 * u, f), "spans 3000 mm: give indentation_mm in millimetres"),
         (lambda t, u, f: (t, u, 0.0 * f + 1.0), "the same in all rows"),
@@ -145,7 +145,7 @@ def test_a_hold_that_is_short_against_the_relaxation_is_refused() -> None:
 
 def test_a_deflection_in_metres_is_refused(plain: np.ndarray) -> None:
     t, u, x, f = plain
-    with pytest.raises(LoadingError, match="The tag shows 0.003 mm for an indentation of 3 mm"):
+    with pytest.raises(LoadingError, match=r"The tag shows 0\.003 mm for an indentation of 3 mm"):
         estimate_loading(t, u, f, 1e-3 * x)
 
 
