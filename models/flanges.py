@@ -176,6 +176,11 @@ STANDARDS: dict[str, FlangeStandard] = {
 """Every flange known by name."""
 
 
+def is_part_file(name: str) -> bool:
+    """Whether the name of a flange is that of a part's file, whose ring models/tools/own_ring finds."""
+    return name.lower().endswith((".step", ".stp", ".stl", ".obj", ".ply"))
+
+
 def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
     """Return the circle that a name such as "ring-90-63-76-6-m5" describes, its first hole on x. Raises InputError."""
     outer, bore, pitch = (1e-3 * float(own[key] or 0.0) for key in ("outer", "bore", "pitch"))

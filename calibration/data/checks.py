@@ -31,7 +31,7 @@ from weldcal.models.files import (
     require_few_lines,
     sha256,
 )
-from weldcal.models.tools.own_ring import is_shape_file, own_ring
+from weldcal.models.flanges import is_part_file
 
 Row = dict[str, str]
 Angles = dict[str, dict[str, float]]
@@ -208,7 +208,9 @@ def _with_own_ring(header: DatasetHeader, folder: Path) -> DatasetHeader:
 
     `feature_in_flange` then states the pose of the file's frame, and becomes that of the ring. Raises InputError.
     """
-    if is_shape_file(header.flange):
+    if is_part_file(header.flange):
+        from weldcal.models.tools.own_ring import own_ring  # reads parts: few datasets need it
+
         ring, given = own_ring(folder / header.flange), header.feature_in_flange
         X_FR = RigidTransform(unit_quaternion(given.wxyz, "feature_in_flange"), given.xyz) @ ring.X_SR
         quaternion = X_FR.rotation().ToQuaternion().wxyz()

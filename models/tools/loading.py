@@ -13,12 +13,11 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document, read_part
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
+from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange, is_part_file
 from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, ToolShape, WeldingTool
 from weldcal.models.tools.elastomers import MATERIALS, Elastomer
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
-from weldcal.models.tools.own_ring import is_shape_file, own_ring
 
 Triple = tuple[float, float, float]
 
@@ -375,8 +374,10 @@ def _tilt(R_FT: RotationMatrix, axis: Triple) -> float:
 def _ring_pose(path: Path, part: RingPart) -> Placed:
     """Return the ring's pose; of a part's file the stated pose is that of the file's frame."""
     placed = _placed(part.xyz_mm, part.rpy_deg)
-    if not is_shape_file(part.standard):
+    if not is_part_file(part.standard):
         return placed
+    from weldcal.models.tools.own_ring import own_ring  # reads parts: few tools need it
+
     X_FR = placed.pose @ own_ring(path.parent / part.standard).X_SR
     x, y, z = X_FR.translation().tolist()
     roll, pitch, yaw = RollPitchYaw(X_FR.rotation()).vector().tolist()
@@ -385,7 +386,9 @@ def _ring_pose(path: Path, part: RingPart) -> Placed:
 
 def _ring(path: Path, part: RingPart) -> FlangeStandard:
     file = path.name
-    if is_shape_file(part.standard):
+    if is_part_file(part.standard):
+        from weldcal.models.tools.own_ring import own_ring
+
         return get_flange(own_ring(path.parent / part.standard).name)
     if part.standard:
         return get_flange(part.standard)

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import LARGEST_RING_M, LEAST_RING_M
-from weldcal.models.workpieces.reading import MESH_SUFFIXES, STEP_SUFFIXES, read_shape
+from weldcal.models.workpieces.reading import read_shape
 
 FLAT_M = 5e-5  # a choice: how far circles of one face may lie off each other, in plane and centre
 FACE = 0.6  # a choice: share of the ring that must be there between its holes
@@ -24,11 +24,6 @@ class OwnRing:
 
     name: str
     X_SR: RigidTransform
-
-
-def is_shape_file(name: str) -> bool:
-    """Whether the name of a flange is that of a part's file."""
-    return name.lower().endswith((*STEP_SUFFIXES, *MESH_SUFFIXES))
 
 
 def own_ring(path: Path) -> OwnRing:
@@ -60,14 +55,14 @@ def own_ring(path: Path) -> OwnRing:
         low, high = 1e3 * LEAST_RING_M, 1e3 * LARGEST_RING_M
         raise InputError(
             f"'{path.name}' has no flat face between an outer circle of {low:.0f} to {high:.0f} mm and a bore of one"
-            " centre, and weldcal calibrates by such a ring only: give a part with one, or measure the flange."
+            " centre, by which weldcal calibrates. Give a part with one."
         )
     upward = found if len(found) == 1 else [one for one in found if one[1] > ALONG]
     widest = max((one[0] for one in upward), default=0.0)
     alike = [one for one in upward if one[0] > ALIKE * widest]
     if len(alike) != 1:
         raise InputError(
-            f"'{path.name}' has {len(found)} rings, and {len(alike) or 'none'} of the widest that look along z: turn"
+            f"'{path.name}' has {len(found)} rings, and {len(alike) or 'none'} of the widest that look along z. Turn"
             " the part in its file so that the face that the scanner sees looks along z, and is the widest that does."
         )
     outer, _, bore, centre, z = alike[0]

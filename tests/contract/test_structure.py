@@ -14,8 +14,8 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
-    "code lines of calibration": 29_809,
-    "code lines of models": 6_233,
+    "code lines of calibration": 29_810,
+    "code lines of models": 6_234,
     "code lines of systems": 19_185,
     "code lines of tools": 22_850,
     "code lines of welding": 9_680,
