@@ -33,9 +33,10 @@ _CATALOGUE = re.compile(
 
 _OWN = re.compile(
     r"ring-(?P<outer>\d+(?:\.\d+)?)-(?P<bore>\d+(?:\.\d+)?)"
-    r"(?:-(?P<pitch>\d+(?:\.\d+)?)-(?P<holes>\d{1,2})-m(?P<thread>\d{1,2}))?"
+    r"(?:-(?P<pitch>\d+(?:\.\d+)?)-(?P<holes>\d{1,2})-m(?P<thread>\d{1,2}))?(?:-c(?P<chamfer>\d+(?:\.\d+)?))?"
 )
-"""A circle of one's own: "ring-90-63" (outer diameter and bore, mm), "ring-90-63-76-6-m5" (pitch circle, holes)."""
+"""A circle of one's own: "ring-90-63" (outer diameter and bore, mm), "ring-90-63-76-6-m5" (pitch circle, holes),
+"ring-90-63-c0.5" (chamfer of its edges, 1 mm without)."""
 
 PAPER_RADIUS_M = 0.031
 """Radius that the flange calibration paper searches for, though ISO 9409-1-50 is 63 mm across: the edge carries a 1 mm
@@ -175,6 +176,11 @@ STANDARDS: dict[str, FlangeStandard] = {
 """Every flange known by name."""
 
 
+def is_part_file(name: str) -> bool:
+    """Whether the name of a flange is that of a part's file, whose ring models/tools/own_ring finds."""
+    return name.lower().endswith((".step", ".stp", ".stl", ".obj", ".ply"))
+
+
 def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
     """Return the circle that a name such as "ring-90-63-76-6-m5" describes, its first hole on x. Raises InputError."""
     outer, bore, pitch = (1e-3 * float(own[key] or 0.0) for key in ("outer", "bore", "pitch"))
@@ -183,7 +189,7 @@ def _own_circle(name: str, own: re.Match[str]) -> FlangeStandard:
         raise InputError(f"The circle '{name}' must be {low:.0f} to {high:.0f} mm wide: ring-OUTER-BORE, in mm.")
     if bore <= 0.0:
         raise InputError(f"The circle '{name}' needs a bore: ring-OUTER-BORE, in mm.")
-    ring = flange_ring(outer, bore, designation=name)
+    ring = flange_ring(outer, bore, designation=name, chamfer_m=1e-3 * float(own["chamfer"] or 1.0))
     if not own["holes"]:
         return ring
     n, thread = int(own["holes"]), int(own["thread"])

@@ -13,6 +13,7 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.tools.elastomers import Elastomer
 
 RING = get_flange("tool-ring-63")
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
@@ -92,6 +93,7 @@ class WeldingTool:
     lateral_stiffness_N_per_m: float = 600.0
     axial_stiffness_N_per_m: float = 300.0
     damping_N_s_per_m: float = 3.0
+    memory: Elastomer | None = None  # creep and loss of the springs; None: none
     tag_reach_m: float = 0.110  # p_FM along +z_F
     tag_size_m: float = 0.010
     tag_dictionary: str = "4X4_50"

@@ -31,6 +31,7 @@ from weldcal.models.files import (
     require_few_lines,
     sha256,
 )
+from weldcal.models.flanges import is_part_file
 
 Row = dict[str, str]
 Angles = dict[str, dict[str, float]]
@@ -199,6 +200,22 @@ def read_header(path: Path) -> DatasetHeader:
         )
     _check_poses(header, path)
     _check_clouds(header, path)
+    return _with_own_ring(header, path.parent)
+
+
+def _with_own_ring(header: DatasetHeader, folder: Path) -> DatasetHeader:
+    """Return the header with the ring of a part's file as its flange, where `flange` names such a file beside it.
+
+    `feature_in_flange` then states the pose of the file's frame, and becomes that of the ring. Raises InputError.
+    """
+    if is_part_file(header.flange):
+        from weldcal.models.tools.own_ring import own_ring  # reads parts: few datasets need it
+
+        ring, given = own_ring(folder / header.flange), header.feature_in_flange
+        X_FR = RigidTransform(unit_quaternion(given.wxyz, "feature_in_flange"), given.xyz) @ ring.X_SR
+        quaternion = X_FR.rotation().ToQuaternion().wxyz()
+        header.flange = ring.name
+        header.feature_in_flange = Feature(X_FR.translation().tolist(), quaternion.tolist())
     return header
 
 

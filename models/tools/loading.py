@@ -13,8 +13,9 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document, read_part
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
+from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange, is_part_file
 from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, ToolShape, WeldingTool
+from weldcal.models.tools.elastomers import MATERIALS, Elastomer
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 
@@ -31,7 +32,8 @@ class RingPart:
         0.0,
         0.0,
     )  # its z out of the face; 180, 0, 0 looks back along the flange, at a scanner above
-    standard: str = ""  # its dimensions by name (tool-ring-63, iso9409-1-50-4-m6 ...); empty: outer_mm and bore_mm
+    # its dimensions by name (tool-ring-63, iso9409-1-50-4-m6 ...), or its STL or STEP file; empty: outer_mm and bore_mm
+    standard: str = ""
     outer_mm: float = 0.0  # outer diameter
     bore_mm: float = 0.0  # diameter of the bore
     thickness_mm: float = 8.0  # of the ring as it is drawn
@@ -50,6 +52,10 @@ class TipPart:
     damping_N_s_per_m: float = 3.0
     mass_kg: float = 0.005  # of what moves with the tip
     finger_radius_mm: float = 2.2  # of the drawn rod between tag and ball
+    material: str = ""  # tpu_85a, tpu_95a, silicone: its creep and its loss; empty: springs without memory
+    relaxation_s: float | None = None  # of the simulated tip, in place of the material's, as are the two shares
+    creep_share: float | None = None  # of the force of a fast press that relaxes
+    loss_share: float | None = None  # of the work of a slow press that does not return
 
 
 @dataclass
@@ -145,6 +151,8 @@ POSITIVE = (
     *("tag.membrane_mm", "finger_camera.focal_px", "finger_camera.width", "finger_camera.height"),
 )
 LEAST_CHORD_M = 0.010  # the servo steers by the line from torch to tip
+LEAST_RELAXATION_S = 0.02  # ten steps of the simulated plant
+MOST_SHARE = 0.6  # of creep or loss: the friction of the simulated tip would chatter beyond
 WELDING = Path(__file__).resolve().parent / "welding.yaml"
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 COLOURS = ("dark", "steel", "copper", "soft", "white")
@@ -212,6 +220,7 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         lateral_stiffness_N_per_m=tip.lateral_stiffness_N_per_mm * 1e3,
         axial_stiffness_N_per_m=tip.axial_stiffness_N_per_mm * 1e3,
         damping_N_s_per_m=tip.damping_N_s_per_m,
+        memory=_memory(path.name, tip),
         tip_reach_m=tip.xyz_mm[2] / 1e3,
         tag_reach_m=tag.xyz_mm[2] / 1e3,
         tag_size_m=tag.size_mm / 1e3 if finger is None or finger.tag_size_m is None else finger.tag_size_m,
@@ -224,12 +233,12 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         nozzle_radius_m=0.5 * part.torch.nozzle_mm / 1e3,
         mass_kg=part.mass_kg,
         centre_of_mass_m=_metres(part.centre_of_gravity_mm),
-        ring=None if part.ring is None else _ring(path.name, part.ring),
+        ring=None if part.ring is None else _ring(path, part.ring),
         ring_height_m=0.008 if part.ring is None else part.ring.thickness_mm / 1e3,
         finger_radius_m=tip.finger_radius_mm / 1e3,
         membrane_radius_m=0.5 * tag.membrane_mm / 1e3,
         tag_plate_m=tag.plate_mm / 1e3,
-        ring_pose=None if part.ring is None else _placed(part.ring.xyz_mm, part.ring.rpy_deg),
+        ring_pose=None if part.ring is None else _ring_pose(path, part.ring),
         tip_pose=Placed(_metres(tip.xyz_mm), (float(rpy[0]), float(rpy[1]), float(rpy[2]))),
         camera_pose=_placed(camera.xyz_mm, camera.rpy_deg),
         tag_pose=_placed(tag.xyz_mm, tag.rpy_deg),
@@ -316,6 +325,25 @@ def _check_sizes(file: str, part: ToolPart) -> None:
         )
 
 
+def _memory(file: str, tip: TipPart) -> Elastomer | None:
+    """Return what the tip remembers, None where the file states nothing of it."""
+    if tip.material and tip.material not in MATERIALS:
+        raise InputError(f"'{file}': tip.material must be one of {', '.join(MATERIALS)}, not '{tip.material}'.")
+    keys = ("relaxation_s", "creep_share", "loss_share")
+    given = {key: value for key in keys if (value := getattr(tip, key)) is not None}
+    if not tip.material and not given:
+        return None
+    if not tip.material and len(given) < len(keys):
+        raise InputError(f"'{file}': tip needs {', '.join(keys)} together, or a material that gives the others.")
+    found = dc.replace(MATERIALS.get(tip.material, MATERIALS["silicone"]), **given)
+    if not found.relaxation_s >= LEAST_RELAXATION_S:
+        raise InputError(f"'{file}': tip.relaxation_s must be {LEAST_RELAXATION_S:g} s or more.")
+    for key in keys[1:]:
+        if not 0.0 <= getattr(found, key) <= MOST_SHARE:
+            raise InputError(f"'{file}': tip.{key} is a share from 0 to {MOST_SHARE:g}, not {getattr(found, key):g}.")
+    return found
+
+
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
     """Compute R_FT, and the torch point (-chord, 0, height) in T, m.
 
@@ -343,7 +371,25 @@ def _tilt(R_FT: RotationMatrix, axis: Triple) -> float:
     return round(float(np.arctan2(x, -z)), 4)
 
 
-def _ring(file: str, part: RingPart) -> FlangeStandard:
+def _ring_pose(path: Path, part: RingPart) -> Placed:
+    """Return the ring's pose; of a part's file the stated pose is that of the file's frame."""
+    placed = _placed(part.xyz_mm, part.rpy_deg)
+    if not is_part_file(part.standard):
+        return placed
+    from weldcal.models.tools.own_ring import own_ring  # reads parts: few tools need it
+
+    X_FR = placed.pose @ own_ring(path.parent / part.standard).X_SR
+    x, y, z = X_FR.translation().tolist()
+    roll, pitch, yaw = RollPitchYaw(X_FR.rotation()).vector().tolist()
+    return Placed((x, y, z), (roll, pitch, yaw))
+
+
+def _ring(path: Path, part: RingPart) -> FlangeStandard:
+    file = path.name
+    if is_part_file(part.standard):
+        from weldcal.models.tools.own_ring import own_ring
+
+        return get_flange(own_ring(path.parent / part.standard).name)
     if part.standard:
         return get_flange(part.standard)
     if not 0.0 < part.bore_mm < part.outer_mm:

@@ -143,6 +143,7 @@ def add_tool(
         joint = plant.AddJoint(PrismaticJoint(f"tip_{name}", parent, body.body_frame(), direction, -0.012, 0.012, 0.0))
         actuator = plant.AddJointActuator(f"tip_{name}", joint)
         stiffness = tool.axial_stiffness_N_per_m if name == "z" else tool.lateral_stiffness_N_per_m
+        stiffness *= 1.0 if tool.memory is None else 1.0 + tool.memory.relaxing
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=tool.damping_N_s_per_m))
         parent = body.body_frame()
 

@@ -71,6 +71,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
         "weldcal replay",
         "weldcal doctor",
         "weldcal check-robot",
+        "weldcal finger loading",
         "weldcal check-cell",
         "weldcal robots",
         "weldcal schema",

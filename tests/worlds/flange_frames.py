@@ -77,7 +77,7 @@ def flange_frame(
     X_CR = random_place(scanner, standard, rng) if X_CR is None else X_CR
     bodies = [m.transformed(X_CR) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, clutter, clear_of=X_CR)
-    return FlangeScan(_scan([*bodies, *before], scanner, rng), X_CR)
+    return FlangeScan(cast([*bodies, *before], scanner, rng), X_CR)
 
 
 def sphere_frame(
@@ -95,7 +95,7 @@ def sphere_frame(
     ball = _ball(radius_m, 121).transformed(X_CF @ RigidTransform(p_FS))
     bodies = [m.transformed(X_CF) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, 0, clear_of=X_CF)
-    return _scan([*bodies, ball], scanner, rng)
+    return cast([*bodies, ball], scanner, rng)
 
 
 def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> FlangeScan:
@@ -106,7 +106,7 @@ def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random
     bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
-    return FlangeScan(_scan(bodies, scanner, rng), None)
+    return FlangeScan(cast(bodies, scanner, rng), None)
 
 
 class FrameFit(NamedTuple):
@@ -240,7 +240,7 @@ def _ball(radius: float, rings: int = 25) -> TriMesh:
     return revolve(profile, max(_SEGMENTS, 2 * rings))
 
 
-def _scan(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
+def cast(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
     """Return the frame that the scanner returns of these bodies."""
     scene = make_scene(merge(*bodies))
     rays = np.zeros((scanner.height, scanner.width, 6), dtype=np.float32)

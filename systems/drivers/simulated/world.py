@@ -28,6 +28,7 @@ from weldcal.models.flanges import flange_mesh
 from weldcal.models.robots import BaseCircle
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
+from weldcal.systems.bodies.relaxing_tip import RelaxingTip
 from weldcal.systems.bodies.tool import (
     STEEL,
     TABLE,
@@ -186,7 +187,11 @@ def build_world(
     moved = [m for m in (instance, tool_instance, second_arm, *fitted) if m is not None]
     compensate_gravity(builder, plant, moved)
     if tool_instance is not None:
-        rest = builder.AddNamedSystem("tip_at_rest", ConstantVectorSource(np.zeros(6)))
+        memory = None if tool is None else tool.memory
+        source = ConstantVectorSource(np.zeros(6)) if memory is None else RelaxingTip(memory, setup.time_step_s)
+        rest = builder.AddNamedSystem("tip_at_rest", source)
+        if memory is not None:
+            builder.Connect(plant.get_state_output_port(tool_instance), rest.get_input_port())
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
     for k, model in enumerate(fitted):
         still = builder.AddNamedSystem(

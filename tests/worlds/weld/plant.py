@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from tests.worlds.weld.budgets import Budget, WeldUnknowns, draw_world, planned_seam, roughness
 from tests.worlds.weld.groove import DROP_M, SEAT_M, Groove, TipPlace
 from tests.worlds.weld.seams import TrueSeam
+from weldcal.models.tools.elastomers import Elastomer
 from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
@@ -74,6 +75,28 @@ class Stamps:
         return RigidTransform(R, (1.0 - share) * p0 + share * p1)
 
 
+class TipMemory:
+    """What the tip's springs remember of its deflection in T; it begins as it was left `free_s` after a long weld."""
+
+    def __init__(self, material: Elastomer, free_s: float = math.inf) -> None:
+        self._material, self._x, self._state = material, np.zeros(3), np.zeros((2, 3))
+        if math.isfinite(free_s):
+            self._x, self._state = PRESSED_M, np.array([PRESSED_M, np.sign(PRESSED_M)])
+            for _ in range(round(free_s / FREE_STEP_S)):
+                self.step(self.rest(), FREE_STEP_S)
+
+    def rest(self) -> Array:
+        """Where the springs pull to (3,) m: beside the rest point, in T."""
+        return self._material.rest(self._state, self._x)
+
+    def step(self, deflection_T: Array, dt: float) -> None:
+        """Go on by dt s to a deflection (3,) m."""
+        self._state = self._material.step(self._state, self._x, deflection_T, dt)
+        self._x = deflection_T
+
+
+PRESSED_M = np.array([0.0, -2e-3, 3e-3])  # of a weld: against the left wall, and up
+FREE_STEP_S = 0.01
 Carrier = Callable[[Array, float], tuple[Array, Array, str | None]]
 """Moves a tool by a velocity (6,) for a time s: its rotation (3, 3), its position (3,) m, and why it has stopped for
 good."""
@@ -138,6 +161,7 @@ def simulate(
     hidden_s: tuple[float, float] = (math.inf, math.inf),
     carrier: Carrier | None = None,
     tacks: tuple[tuple[float, float, float], ...] = (),
+    memory: TipMemory | None = None,
 ) -> StudyRun:
     """One weld of a seam in a budget; everything random follows from the seed. The servo is the cell's own, unchanged.
 
@@ -147,6 +171,7 @@ def simulate(
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
             the tag is not seen; tacks: from, to and lift of the ball, m;
+            memory: of the tip's springs;
             carrier: what moves the tool from where it is; None: a robot that follows every
             velocity.
 
@@ -179,7 +204,9 @@ def simulate(
     commands: list[WeldingCommand] = []
     for k in range(int(time_limit_s / dt)):
         t = k * dt
-        centre = tip.step(p, dt)
+        centre = tip.step(p if memory is None else p + R @ memory.rest(), dt)
+        if memory is not None:
+            memory.step(R.T @ (centre - p), dt)
         X_BT, now = RigidTransform(RotationMatrix(R), p), stamps.pose(t, R, p)
         if t >= next_frame - 1e-9:
             next_frame += FRAME_PERIOD_S

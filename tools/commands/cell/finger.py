@@ -1,4 +1,4 @@
-"""weldcal finger calibrate: the finger camera, its tag and the soft tip, from pictures."""
+"""weldcal finger calibrate: the finger camera, its tag and the soft tip, from pictures; finger loading: its creep."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
-from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.cli.options import LOOK, Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.cell.board import CharucoBoard
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.page import Bullets, Section, TableRows, page_html
@@ -29,11 +29,14 @@ from weldcal.welding.finger.calibration import (
     calibrate_tip,
     find_board,
 )
+from weldcal.welding.finger.creep import LoadingError, LoadingEstimate, estimate_loading
 from weldcal.welding.finger.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 COLUMNS = ("x_mm", "y_mm", "z_mm")
 FORCES = ("fx_n", "fy_n", "fz_n")
+PRESS_M = 0.003  # of a weld, as a rule
+ZERO_M = 5e-5  # how far from its zero a tip may be at touch-on: a sixth of the weld's 0.3 mm
 _NO_TOUCHES = "Only the camera is calibrated: without touches nothing says how exactly the tip is measured."
 
 
@@ -75,6 +78,53 @@ def finger_calibrate(
         }
     summary = {"state": "done", "out": str(call.written), "without_board": list(report.without_board), **found}
     return Outcome(summary, values=values, first=report.first)
+
+
+@command("finger loading", common=LOOK, short_help="Find the soft tip's creep and loss from a loading cycle.")
+def finger_loading(
+    call: Call,
+    table: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TABLE", help="CSV: t_s, indentation_mm, and force_N, deflection_mm as the tag shows it, or both."
+        ),
+    ],
+) -> Outcome:
+    """Find relaxation time, creep and loss of the soft tip, with their sigmas, from one press on a rigid plate: down,
+    held, and back until the tip is free."""
+    found = read_loading(table)
+    tip, (time, creep, loss) = found.tip, found.sigmas
+    shown = {"relaxation_s": (tip.relaxation_s, time), "creep_share": (tip.creep_share, creep)}
+    shown["loss_share"] = (tip.loss_share, loss)
+    summary: dict[str, Any] = {"state": "done", **{key: value for key, (value, _) in shown.items()}}
+    summary |= {f"{key}_sigma": sigma for key, (_, sigma) in shown.items()}
+    summary["free_s"] = tip.free_s(PRESS_M, ZERO_M)
+    summary["concerns"] = list(found.concerns)
+    values = {key.replace("_", " "): f"{value:.3g} +- {sigma:.2g}" for key, (value, sigma) in shown.items()}
+    if found.stiffness_N_per_m is not None:
+        summary["stiffness_N_per_mm"] = 1e-3 * found.stiffness_N_per_m
+        values["stiffness"] = f"{1e-3 * found.stiffness_N_per_m:.3g} N/mm, after relaxation"
+    values["wait between welds"] = f"{summary['free_s']:.1f} s, until a free tip is {1e3 * ZERO_M:g} mm from its zero"
+    values["tool file"] = f"tip: {{{', '.join(f'{key}: {value:.3g}' for key, (value, _) in shown.items())}}}"
+    return Outcome(summary, values=values, rows={"open": " ".join(found.concerns) or "nothing"})
+
+
+def read_loading(table: Path) -> LoadingEstimate:
+    """Return the estimate from a table of a loading cycle. Raises InputError where it is none."""
+    header, rows = read_rows(table)
+    keys = ("t_s", "indentation_mm", *(name for name in ("force_n", "deflection_mm") if name in header))
+    if not {"t_s", "indentation_mm"} <= set(header) or len(keys) == 2:
+        raise InputError(
+            f"'{table.name}' needs the columns t_s, indentation_mm, and force_N, deflection_mm or both; it has"
+            f" {', '.join(header) or 'none'}."
+        )
+    column = {key: np.array([_number(table, line, row, key, "") for line, row in enumerate(rows, 2)]) for key in keys}
+    t, u, force = column["t_s"], 1e-3 * column["indentation_mm"], column.get("force_n")
+    shown = 1e-3 * column["deflection_mm"] if "deflection_mm" in column else None
+    try:
+        return estimate_loading(t, u, force, shown)
+    except LoadingError as error:
+        raise InputError(f"'{table.name}': {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -303,9 +353,9 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
     )
 
 
-def _number(table: Path, line: int, row: dict[str, str], key: str) -> float:
+def _number(table: Path, line: int, row: dict[str, str], key: str, empty: str = "0") -> float:
     try:
-        found = float(row[key] or "0")
+        found = float(row[key] or empty)
     except ValueError:
         found = np.nan
     if not np.isfinite(found):
