@@ -39,7 +39,6 @@ class StepEstimate:
 
     Attributes:
         correction: of the sensor. normal_F: (3,) of the plane of light in F, its side as S has y, and its sigma.
-        tilts_rad: (n,) of the plane of light to the target's normal, in each profile that was used.
         wrong: numbers of the profiles that were excluded.
         reduced_chi2: of the whitened residuals; it has widened the covariance where it exceeds 1.
     """
@@ -47,7 +46,6 @@ class StepEstimate:
     correction: SensorCorrection
     normal_F: Floats
     normal_sigma_rad: float
-    tilts_rad: Floats
     reduced_chi2: float
     wrong: tuple[int, ...] = ()
 
@@ -69,14 +67,15 @@ def shown_steps(profiles: Sequence[Floats], heights_m: Floats) -> ShownSteps:
         TooFewRotations: fewer than five do.
     """
     heights = np.asarray(heights_m, float)
-    size = max((float(np.ptp(q, axis=0).max()) for p in profiles if len(q := p[np.isfinite(p).all(axis=1)])), default=0)
-    least = float(np.diff(heights).min()) if len(heights) > 1 else 0.0
-    if not least > 0.0:
+    returns = [q for p in profiles if len(q := p[np.isfinite(p).all(axis=1)])]
+    size = max((float(np.ptp(q, axis=0).max()) for q in returns), default=0.0)
+    least = float(np.diff(heights).min(initial=np.inf))
+    if not 0.0 < least < np.inf:
         raise InputError("Each step's height is above 0 mm.")
     if least > size:
         raise InputError(
-            f"A step of {1e3 * least:.5g} mm does not fit into profiles of {1e3 * size:.3g} mm. Give --height in mm, and"
-            " check the unit of the profiles."
+            f"A step of {1e3 * least:.5g} mm does not fit into profiles of {1e3 * size:.3g} mm. Give --height in mm,"
+            " and check the unit of the profiles."
         )
     orders = [heights, heights[-1] - heights[::-1]]  # z may grow either way
     found: dict[int, StepFaces] = {}
@@ -93,8 +92,8 @@ def shown_steps(profiles: Sequence[Floats], heights_m: Floats) -> ShownSteps:
         raise FeatureNotFound(f"None of the {len(profiles)} profiles shows the step. {reason}")
     if len(found) < MINIMUM_PROFILES:
         raise TooFewRotations(
-            f"{len(found)} of {len(profiles)} profiles show the step, and {MINIMUM_PROFILES} or more must: let the laser"
-            " line cross it, with the flange tilted by 15 to 30 deg to all sides."
+            f"{len(found)} of {len(profiles)} profiles show the step. Take {MINIMUM_PROFILES} or more in which the"
+            " laser line crosses it, the flange tilted by 15 to 30 deg to all sides."
         )
     of = list(found.values())
     return ShownSteps(np.array(list(found)), np.array([f.gradient for f in of]), np.array([f.covariance for f in of]))
@@ -147,7 +146,6 @@ def step_sensor(rotation: Floats, profiles: Sequence[Floats], shown: ShownSteps)
         correction=correction,
         normal_F=fit.rotation[:, 1],
         normal_sigma_rad=float(np.sqrt(whole[3, 3] + whole[5, 5])),
-        tilts_rad=np.arcsin(np.clip(np.abs(fit.normals_S[:, 1]), 0.0, 1.0)),
         reduced_chi2=chi2,
         wrong=tuple(int(k) for k in shown.number[~keep]),
     )
@@ -155,12 +153,11 @@ def step_sensor(rotation: Floats, profiles: Sequence[Floats], shown: ShownSteps)
 
 @dataclass(frozen=True, eq=False)
 class StepFit:
-    """The solution, its whitened residuals off (n, 2), R_FS (3, 3) and the target's normals (n, 3) in S."""
+    """The solution, its whitened residuals off (n, 2), and R_FS (3, 3)."""
 
     result: OptimizeResult
     off: Floats
     rotation: Floats
-    normals_S: Floats
 
 
 def fit_step(R_BF: Floats, g: Floats, C: Floats) -> StepFit:
@@ -210,5 +207,5 @@ def _polished(R_BF: Floats, g: Floats, C: Floats, R0: Floats, n0: Floats) -> Ste
     _, R, m = placed(x)
     n = R_BF[0] @ m[0]
     if n[int(np.argmax(np.abs(n)))] < 0.0:  # both turned about y fit as well
-        R, m = R * [-1.0, 1.0, -1.0], -m
-    return StepFit(found, found.fun[:-3].reshape(-1, 2), R, m @ R)
+        R = R * [-1.0, 1.0, -1.0]
+    return StepFit(found, found.fun[:-3].reshape(-1, 2), R)

@@ -26,13 +26,12 @@ ROUNDS = 10
 class StepFaces:
     """The target's height in one profile is ``gradient`` (2,) . [x, z], plus a constant; `covariance` (2, 2) of it.
 
-    The gradient has no unit: metres of height for each metre in the profile. It points from the sensor to the target
-    where z grows away from the sensor. ``sigma_m`` is of a sample; ``faces`` (n,) are numbers of the heights shown.
+    The gradient has no unit: metres of height for each metre in the profile. Its z is below 0: height grows upwards
+    where z grows away from the sensor. ``faces`` (n,) are numbers of the heights shown.
     """
 
     gradient: Floats
     covariance: Floats
-    sigma_m: float
     faces: NDArray[np.intp]
 
 
@@ -44,7 +43,7 @@ def step_faces(profile: ArrayLike, heights_m: Floats) -> StepFaces:
     """
     p = returns_of(profile, 2 * MINIMUM_SAMPLES, "step")
     width = max(MINIMUM_SAMPLES, int(WINDOW * len(p)))
-    best: tuple[int, Floats, NDArray[np.intp], float] | None = None
+    best: tuple[int, Floats, NDArray[np.intp]] | None = None
     for start in np.linspace(0, len(p) - width, WINDOWS).astype(int):
         n, tolerance = _grown(p, p[start : start + width])
         if tolerance > MOST_TOLERANCE * np.diff(heights_m).min():  # the window lies across a step
@@ -54,7 +53,7 @@ def step_faces(profile: ArrayLike, heights_m: Floats) -> StepFaces:
         shown = faces[counts >= MINIMUM_SAMPLES]
         score = int(np.sum(np.isin(label, shown)))
         if len(shown) > 1 and (best is None or score > best[0]):
-            best = score, n, np.where(np.isin(label, shown), label, -1), tolerance
+            best = score, n, np.where(np.isin(label, shown), label, -1)
     if best is None:
         steps = ", ".join(f"{1e3 * h:.4g}" for h in np.diff(heights_m))
         raise FeatureNotFound(
@@ -94,7 +93,7 @@ def _labels(across: Floats, at: float, heights_m: Floats, tolerance: float) -> N
     return np.where(off.min(axis=1) < tolerance, off.argmin(axis=1), -1)
 
 
-def _fitted(p: Floats, n: Floats, label: NDArray[np.intp], tolerance: float, heights_m: Floats) -> StepFaces:
+def _fitted(p: Floats, n: Floats, label: NDArray[np.intp], heights_m: Floats) -> StepFaces:
     """Fit one direction and one ratio of heights to all faces, by Tukey's weights."""
     inside = np.ones(len(p), bool)
     for k in range(1, ENDS + 1):
@@ -106,9 +105,8 @@ def _fitted(p: Floats, n: Floats, label: NDArray[np.intp], tolerance: float, hei
         raise FeatureNotFound("The faces of the step are too short in the profile: come closer, or let it lie across.")
     inside &= np.isin(label, shown)
     u, h = p[inside] - p[inside].mean(axis=0), heights_m[label[inside]]
-    h, sigma = h - h.mean(), tolerance / SIGMAS
+    h = h - h.mean()
     weight, ratio, offset = np.ones(len(u)), 1.0, 0.0
-    J = np.empty((len(u), 3))
     for k in range(ROUNDS):
         along = np.array([n[1], -n[0]])  # d n / d angle
         J = np.column_stack([u @ along, -np.ones(len(u)), -h])
@@ -125,4 +123,4 @@ def _fitted(p: Floats, n: Floats, label: NDArray[np.intp], tolerance: float, hei
     spread = sigma**2 * float((weight**2).mean() / weight.mean())
     C = np.linalg.inv(J.T @ (weight[:, None] * J))[np.ix_([0, 2], [0, 2])] * spread
     by = np.column_stack([along / ratio, -n / ratio**2])
-    return StepFaces(n / ratio, np.asarray(by @ C @ by.T), sigma, shown)
+    return StepFaces(n / ratio, np.asarray(by @ C @ by.T), shown)

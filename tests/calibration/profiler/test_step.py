@@ -287,7 +287,7 @@ def test_an_edge_with_the_correction_is_where_it_is_not_without(tmp_path: Path) 
     ("words", "sentence"),
     [
         (("--height", "10000"), "A step of 10000 mm does not fit into profiles of"),
-        (("--height", "0"), "Each step's height is above 0 mm, not '0'."),
+        (("--height", "0"), "Each step's height is above 0 mm."),
         (("--height", "ten"), "The heights are numbers in mm with commas between, as --height 10,5, not 'ten'."),
         (("--height", "3.3"), "None of the 12 profiles shows the step. The profile shows no two parallel faces 3.3 mm"),
     ],

@@ -1,7 +1,7 @@
 """weldcal profiler step: scale, shear and plane of light of a profiler from profiles of a step target."""
 
 from dataclasses import replace
-from typing import Annotated, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from weldcal.tools.commands.profiler.result import (
     read_measurements,
     with_warnings,
 )
+
+_NAMES = ("x_scale_percent", "z_scale_percent", "shear_deg")
+_UNITS = (100.0, 100.0, 2.0 * np.degrees(1.0))  # the axes are off their right angle by twice the shear
 
 
 @command(
@@ -43,23 +46,17 @@ def step(
     data = data.decided(step_fit(shown), "step")
     X = cast(FlangePoses, data.poses())
     e = step_sensor(X.rotation, data.profiles or (), shown)
-    x, z, shear = (float(v) for v in e.correction.values)
-    sigma = [float(v) for v in np.sqrt(np.diag(e.correction.covariance))]
-    found = {
+    values, sigma = e.correction.values, np.sqrt(np.diag(e.correction.covariance))
+    found: dict[str, Any] = {
         "scans": len(X),
         "without_step": np.setdiff1d(np.arange(len(X)), shown.number).tolist(),
         "wrong_scans": list(e.wrong),
-        "x_scale_percent": 100.0 * x,
-        "z_scale_percent": 100.0 * z,
-        "shear_deg": 2.0 * float(np.degrees(shear)),  # off the right angle of the axes x and z
-        "sigma_x_scale_percent": 100.0 * sigma[0],
-        "sigma_z_scale_percent": 100.0 * sigma[1],
-        "sigma_shear_deg": 2.0 * float(np.degrees(sigma[2])),
         "light_plane_normal_F": e.normal_F.tolist(),
         "sigma_light_plane_deg": float(np.degrees(e.normal_sigma_rad)),
-        "largest_tilt_deg": float(np.degrees(e.tilts_rad.max())),
         "reduced_chi2": e.reduced_chi2,
     }
+    for name, unit, value, s in zip(_NAMES, _UNITS, values, sigma, strict=True):
+        found |= {name: float(unit * value), f"sigma_{name}": float(unit * s)}
     folder = call.folder("profiler", file.stem)
     save_correction(replace(e.correction, figures=found, data_sha256=data.digest), folder)
     return Outcome({"state": "done", **with_warnings(data, found), "written_to": str(folder)})
@@ -69,12 +66,9 @@ def parse_heights(text: str) -> Floats:
     """Return the heights (k + 1,) m of the faces over the lowest, from "10" or "10,5" mm.
 
     Raises:
-        InputError: not numbers above 0.
+        InputError: not numbers.
     """
     try:
-        steps = np.array([1e-3 * float(v) for v in text.split(",")])
+        return np.concatenate([[0.0], np.cumsum([1e-3 * float(v) for v in text.split(",")])])
     except ValueError as e:
         raise InputError(f"The heights are numbers in mm with commas between, as --height 10,5, not '{text}'.") from e
-    if not (np.isfinite(steps).all() and (steps > 0.0).all()):
-        raise InputError(f"Each step's height is above 0 mm, not '{text}'.")
-    return np.concatenate([[0.0], np.cumsum(steps)])
