@@ -17,6 +17,7 @@ from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.joint import sphere_optima
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.step_target import ShownSteps, fit_step
 from weldcal.models.errors import WeldcalError
 
 CHANCE = 1e-6  # as for readings of a dataset (eye_on_base/observations.py)
@@ -26,6 +27,7 @@ _FLOOR_M = 2e-6  # printed digits
 _SIGMAS_M = (0.06e-3, 0.5e-3)  # of the robust loss of an edge, by which readings are compared
 _LARGEST_M = 1e-3  # residual of a reading that may be used
 _POINTS = 16  # points of a profile of the sphere that are compared
+_STEP_M = 0.01e-3  # a choice: what one sigma of a step's height is taken for
 _SAME_M, _SAME_RAD = 0.1e-3, 1e-3
 
 
@@ -152,6 +154,18 @@ def sphere_fit(profiles: Sequence[Floats], radius_m: float) -> Fit:
             at = p_F @ poses.rotation[k].T + poses.translation[k]
             square.append(float(np.mean((np.linalg.norm(at - centre, axis=1) - radius_m) ** 2)))
         return ReadingFit(np.array(square), 3, 9, R, p_FS)
+
+    return fit
+
+
+def step_fit(shown: ShownSteps) -> Fit:
+    """Return the comparison of readings by profiles of one step target."""
+
+    def fit(poses: FlangePoses) -> ReadingFit:
+        R_BF = poses.rotation[shown.number]
+        found = fit_step(R_BF, shown.gradient, shown.covariance)
+        square = _STEP_M**2 * np.sum(found.off**2, axis=1)
+        return ReadingFit(square, 2, 8, found.rotation, np.zeros(3))
 
     return fit
 

@@ -342,7 +342,7 @@ class GrooveScan:
     q_touch: Floats
 
 
-def _seam(u: Floats, offset_m: float) -> Floats:
+def seam_line(u: Floats, offset_m: float) -> Floats:
     """Points (n, 2) at a distance from the seam y = A sin(2 pi x / L)."""
     w = 2.0 * np.pi / LENGTH_M
     slope = SWING_M * w * np.cos(w * u)
@@ -350,11 +350,17 @@ def _seam(u: Floats, offset_m: float) -> Floats:
     return np.asarray(np.column_stack([u, SWING_M * np.sin(w * u)]) + offset_m * n)
 
 
-def groove_mesh() -> TriMesh:
+def groove_lines(depth_m: float) -> tuple[tuple[float, float], ...]:
+    """Return offset from the seam and height, m, of edge, root and edge of a groove of 45 deg."""
+    half = depth_m * np.tan(np.radians(22.5))
+    return (-half, 0.0), (0.0, -depth_m), (half, 0.0)
+
+
+def groove_mesh(depth_m: float = DEPTH_M) -> TriMesh:
     """Plate with the groove: strips ruled between lines along the seam; its top at z = 0."""
     u = np.linspace(-0.05, LENGTH_M + 0.05, 1601)
-    lines = [(-0.07, 0.0), (-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0), (0.07, 0.0)]
-    vertices = np.vstack([np.column_stack([_seam(u, offset), np.full(len(u), z)]) for offset, z in lines])
+    lines = [(-0.07, 0.0), *groove_lines(depth_m), (0.07, 0.0)]
+    vertices = np.vstack([np.column_stack([seam_line(u, offset), np.full(len(u), z)]) for offset, z in lines])
     n = len(u)
     k = np.arange(n - 1)
     quads = [(j * n + k, j * n + k + 1, (j + 1) * n + k + 1, (j + 1) * n + k) for j in range(len(lines) - 1)]
@@ -391,32 +397,37 @@ def _seen(
     return cast_profiles(make_scene(mesh), R, o, preset)
 
 
-def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
-    """25 stations along the groove, the laser line across it; 2 % spikes and 3 % gaps in the profiles."""
+def scan_groove(
+    world: SphereWorld, seed: int, *, depth_m: float = DEPTH_M, stations: int = STATIONS, middle_m: float = 0.195
+) -> GrooveScan:
+    """Stations along the groove, the laser line across it; 2 % spikes and 3 % gaps in the profiles.
+
+    ``middle_m`` is the distance at which the sensor sees the middle of the plate's top (its z), less the tilt.
+    """
     rng = np.random.default_rng([seed, 73])
     place = world.cell.groove
     turn = Rotation.from_euler("z", world.cell.groove_turn_deg, degrees=True).as_matrix()
-    u = np.linspace(0.008, LENGTH_M - 0.008, STATIONS)
+    u = np.linspace(0.008, LENGTH_M - 0.008, stations)
     w = 2.0 * np.pi / LENGTH_M
     yaw = np.arctan(SWING_M * w * np.cos(w * u))
-    across = np.column_stack([-np.sin(yaw), np.cos(yaw), np.zeros(STATIONS)])
-    down = np.tile([0.0, 0.0, -1.0], (STATIONS, 1))
+    across = np.column_stack([-np.sin(yaw), np.cos(yaw), np.zeros(stations)])
+    down = np.tile([0.0, 0.0, -1.0], (stations, 1))
     R_PS = np.stack([across, np.cross(down, across), down], axis=2)
-    R_PS = R_PS @ Rotation.from_euler("ZYX", rng.uniform(-3, 3, (STATIONS, 3)), degrees=True).as_matrix()
-    on = np.column_stack([_seam(u, 0.0), np.zeros(STATIONS)]) @ turn.T + place
-    p_S = np.column_stack([rng.uniform(-0.003, 0.003, STATIONS), np.zeros(STATIONS), np.full(STATIONS, 0.195)])
+    R_PS = R_PS @ Rotation.from_euler("ZYX", rng.uniform(-3, 3, (stations, 3)), degrees=True).as_matrix()
+    on = np.column_stack([seam_line(u, 0.0), np.zeros(stations)]) @ turn.T + place
+    p_S = np.column_stack([rng.uniform(-0.003, 0.003, stations), np.zeros(stations), np.full(stations, middle_m)])
     q = world.joints(*world.viewing(turn @ R_PS, p_S, on))
     X = world.repeated(q, rng)
-    clean = _seen(world, groove_mesh(), turn, place, X, _perfect(0.088, 440))
+    clean = _seen(world, groove_mesh(depth_m), turn, place, X, _perfect(0.088, 440))
     p = world.measured(clean, rng)
     spikes = rng.random(p.shape[:2]) < 0.02
     p[spikes, 1] += rng.uniform(-0.015, 0.015, int(spikes.sum()))
     p[rng.random(p.shape[:2]) < 0.03] = np.nan
     fine = np.linspace(-0.05, LENGTH_M + 0.05, 40001)
-    features, touched = np.empty((STATIONS, 3, 2)), np.empty((STATIONS, 3, 3))
-    for j, (offset, z) in enumerate(((-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0))):
-        line = np.column_stack([_seam(fine, offset), np.full(len(fine), z)]) @ turn.T + place
-        for k in range(STATIONS):
+    features, touched = np.empty((stations, 3, 2)), np.empty((stations, 3, 3))
+    for j, (offset, z) in enumerate(groove_lines(depth_m)):
+        line = np.column_stack([seam_line(fine, offset), np.full(len(fine), z)]) @ turn.T + place
+        for k in range(stations):
             one = FlangePoses(X.rotation[[k] * len(fine)], X.translation[[k] * len(fine)])
             y = (((line - one.translation[0]) @ one.rotation[0]) - world.translation) @ world.rotation
             near = np.flatnonzero((np.diff(np.sign(y[:, 1])) != 0) & (np.abs(y[:-1, 0]) < 0.05))
@@ -427,8 +438,8 @@ def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
     order = np.argsort(features[:, :, 0], axis=1)
     features = np.take_along_axis(features, order[:, :, None], axis=1)
     touched = np.take_along_axis(touched, order[:, :, None], axis=1)
-    R_touch = np.tile(DOWN, (3 * STATIONS, 1, 1))
-    q_touch = world.touching(touched.reshape(-1, 3), R_touch).reshape(STATIONS, 3, 6)
+    R_touch = np.tile(DOWN, (3 * stations, 1, 1))
+    q_touch = world.touching(touched.reshape(-1, 3), R_touch).reshape(stations, 3, 6)
     calm = replace(world, errors=replace(world.errors, noise_m=0.0))
     return GrooveScan(q, p, calm.measured(features, rng), q_touch)
 

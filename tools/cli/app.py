@@ -40,7 +40,7 @@ PANELS = {
 ORDER = (
     *(name for names in PANELS.values() for name in names),
     *("tablet serve", "tablet calibrate", "tablet demo", "profiler edge", "profiler sphere", "profiler compensate"),
-    *("profiler seam", "profiler bead", "profiler clock", "profiler live"),
+    *("profiler seam", "profiler bead", "profiler clock", "profiler step", "profiler live"),
 )
 """The full names of the commands in the order of the help text; the others follow by name."""
 

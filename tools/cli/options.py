@@ -240,6 +240,7 @@ KEYS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "intrinsics": ("a file", Path),
     "motions": _YES_NO,
     "scanner-correction": _YES_NO,
+    "sensor-correction": ("a file or folder", Path),
     "set": ("a name", str),
     "trial": ("a whole number", int),
     "pitch": _MM,

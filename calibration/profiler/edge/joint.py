@@ -27,6 +27,7 @@ from weldcal.calibration.profiler.edge.model import (
 )
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points, distinct, times_own, turned
 from weldcal.calibration.profiler.result import ProfilerEstimate, refuse_open, worst_direction
+from weldcal.calibration.profiler.sensor import SensorCorrection
 from weldcal.models.errors import InputError
 
 ITERATIONS = 60
@@ -351,6 +352,31 @@ def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: fl
         point=state.point,
         direction=state.direction,
     )
+
+
+def with_sensor(
+    e: EdgeEstimate,
+    sensor: SensorCorrection,
+    poses: FlangePoses,
+    p: Floats,
+    *,
+    sigma_robot_m: float,
+    sigma_xz_m: ArrayLike,
+) -> Floats:
+    """Covariance (6, 6) of an estimate by points that a sensor correction corrected, with what that leaves open.
+
+    Args:
+        e: the estimate; sensor: the correction; poses: of the scans.
+        p: (n, 2) m, the points as they were measured; sigma_robot_m, sigma_xz_m: as for edge_joint.
+    """
+    predicted_p, J, by_robot = predicted(EdgeState(e.rotation, e.translation, e.point, e.direction), poses)
+    x, z = (p - sensor.origin).T
+    by_sensor = np.stack([np.column_stack([x, 0 * x, z]), np.column_stack([0 * x, z, x])], axis=1)
+    covariance = measurement_covariance(by_robot, sigma_robot_m, np.asarray(sigma_xz_m, float))
+    _, both = whitened(covariance, predicted_p, np.concatenate([J, by_sensor], axis=2))
+    both = both[e.inliers].reshape(-1, 13)
+    G = np.linalg.lstsq(both[:, :10], both[:, 10:], rcond=None)[0]
+    return np.asarray(e.covariance + left_covariance(e.rotation, G @ sensor.covariance @ G.T))
 
 
 def edge_crb(

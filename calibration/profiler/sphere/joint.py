@@ -222,7 +222,7 @@ def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, 
     _check(data, "rigid")
     layout = ParameterLayout(tip=data.touches is not None, affine=False, joints=False)
     problem = SphereProblem(data, layout, sigmas)
-    starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
+    starts = sphere_starts(data.poses, problem.corrected_profiles, data.radius_m)
     found = [problem.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
     return sorted(found, key=lambda one: float(one[1].cost))
 
@@ -233,7 +233,7 @@ def _started(init: SphereEstimate, data: SphereData, layout: ParameterLayout) ->
     if layout.tip:
         parts.append(np.zeros(3) if init.tip is None or data.tip is None else init.tip - data.tip)
     if layout.affine:
-        parts.append(init.affine)
+        parts.append(init.affine - (0.0 if data.sensor is None else data.sensor.values))
     if layout.joints:
         parts.append(init.arm_errors.values)
     return np.concatenate(parts)
@@ -369,7 +369,7 @@ def _estimate(problem: SphereProblem, R0: Floats, x: Floats) -> SphereEstimate:
         condition=condition,
         center=np.asarray(c),
         tip=None if problem.data.tip is None else problem.data.tip + tip,
-        affine=np.asarray(affine),
+        affine=problem.affine + affine,
         origin=problem.origin,
         arm_errors=ProfilerArmErrors.of(arm),
         wrong_poses=wrong,
@@ -399,10 +399,10 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
 
     Gauss-Newton in the radius, all other unknowns solved at each step.
     """
-    scans, radius = SphereData(poses=data.poses, profiles=data.profiles, radius_m=start_m), start_m
+    scans, radius = data.scans(start_m), start_m
     layout = ParameterLayout(tip=False, affine=False, joints=False)
     problem = SphereProblem(scans, layout, sigmas)
-    starts = sphere_starts(data.poses, problem.profiles, start_m)
+    starts = sphere_starts(data.poses, problem.corrected_profiles, start_m)
     if not starts:
         return None
     R, x = starts[0][0], np.concatenate([np.zeros(3), starts[0][1], starts[0][2]])

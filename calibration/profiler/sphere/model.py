@@ -17,6 +17,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
+from weldcal.calibration.profiler.sensor import SensorCorrection
 
 POINTS_PER_POSE = 120
 ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
@@ -58,6 +59,8 @@ class SphereData:
         poses: flange at each scan; profiles: (m, 2) [x, z] m of the sphere in each; radius_m: of the sphere.
         touches: flange at each touch, tip: (3,) m in F as far as it is known; both or none.
         arm, q, touch_q: the arm's table and its joints (n, 6) rad at scans and touches, for the model with joints.
+        sensor: what is known of the profiler's scale and shear before: the model rigid takes it as it is, the others
+            start from it and hold it by its covariance.
     """
 
     poses: FlangePoses
@@ -68,6 +71,11 @@ class SphereData:
     arm: DhArm | None = None
     q: Floats | None = None
     touch_q: Floats | None = None
+    sensor: SensorCorrection | None = None
+
+    def scans(self, radius_m: float) -> SphereData:
+        """Return the scans alone, of a sphere of this radius."""
+        return SphereData(poses=self.poses, profiles=self.profiles, radius_m=radius_m, sensor=self.sensor)
 
     def without(self, *scans: int) -> SphereData:
         """Return the same but for these scans."""
@@ -143,6 +151,12 @@ class SphereProblem:
         self.of = np.repeat(np.arange(len(self.profiles)), self.count)
         self.p = np.vstack(self.profiles)
         self.origin = self.p.mean(axis=0)
+        sensor = data.sensor
+        self.affine = np.zeros(3) if sensor is None else sensor.values  # the unknowns are what is added to it
+        self._prior = np.diag(1.0 / layout.sigmas(sigmas))[9:]
+        if sensor is not None and layout.affine:
+            k = 3 * layout.tip
+            self._prior[k : k + 3, 9 + k : 12 + k] = np.linalg.inv(np.linalg.cholesky(sensor.covariance))
         self._R0, self._t0 = np.eye(3), np.zeros(3)
         self._whiten: list[tuple[Floats, Floats]] | None = None
         self._slant = np.ones(len(self.p))
@@ -166,6 +180,11 @@ class SphereProblem:
         self.share_robot_error(found.x)
         found = least_squares(self.residual, found.x, jac=self.derivatives, x_scale=scale, **ROBUST)
         return R, found
+
+    @property
+    def corrected_profiles(self) -> list[Floats]:
+        """Profiles (m, 2), as what is known before corrects them."""
+        return [corrected(p, self.affine, self.origin)[:, [0, 2]] for p in self.profiles]
 
     def linearise_about(self, rotation: Floats) -> None:
         """R_FS (3, 3) to which the first three unknowns are a turn in F."""
@@ -206,7 +225,7 @@ class SphereProblem:
         if poses is not self.data.poses:
             rotation, translation = poses.rotation[self.of], poses.translation[self.of]
         R = exp_rotation(pose[:3]) @ self._R0
-        turned = corrected(self.p, affine, self.origin) @ R.T
+        turned = corrected(self.p, self.affine + affine, self.origin) @ R.T
         at = np.einsum("nij,nj->ni", rotation, turned + pose[3:]) + translation - c
         felt = np.empty((0, 3))
         if touches is not None and self.data.tip is not None:
@@ -230,8 +249,7 @@ class SphereProblem:
         r = (np.linalg.norm(at, axis=1) - R) / self.sigmas.sensor_m
         r = self._whitened(r[:, None])[:, 0]
         touch = (np.linalg.norm(felt, axis=1) - R) / self.sigmas.touch_m
-        prior = x / self.layout.sigmas(self.sigmas)
-        return np.concatenate([r, touch, prior[9:]])
+        return np.concatenate([r, touch, self._prior @ x])
 
     def _whitened(self, columns: Floats) -> Floats:
         """Rows (m, k) of the profiles' points, in sigmas of independent errors once these are known."""
@@ -287,8 +305,7 @@ class SphereProblem:
                 columns.append(by)
         top = self._whitened(np.hstack(scan) / self.sigmas.sensor_m)
         bottom = np.hstack(touch) / self.sigmas.touch_m if m else np.empty((0, self.layout.size))
-        prior = np.diag(1.0 / self.layout.sigmas(self.sigmas))[9:]
-        return np.vstack([top, bottom, prior])
+        return np.vstack([top, bottom, self._prior])
 
     def by_radius(self) -> Floats:
         """Derivative of `residual` by the sphere's radius (1/m)."""

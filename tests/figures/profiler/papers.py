@@ -219,6 +219,11 @@ def named_figures(points: Mapping[str, float], seams: Sequence[Floats], bosses: 
 
 def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
     """Return the four methods on one world's scans and touches."""
+    return published_records(world) | joint_records(world)
+
+
+def published_records(world: WorldData) -> dict[str, ProfilerRecord]:
+    """Return the paper's method before and after its compensation, on one world's scans and touches."""
     data = world.trial.data
     assert data.touches is not None
     assert data.tip is not None
@@ -239,7 +244,6 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
         SPHERE_METHODS[1]: ProfilerRecord(
             method=SPHERE_METHODS[1], rotation=best.rotation, translation=best.translation, tip=data.tip
         ),
-        **joint_records(world),
     }
 
 
@@ -292,10 +296,18 @@ def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:
 
 def _off(record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats) -> Floats:
     """Distances (n,) mm from where a point is sensed to where the tip touched it."""
+    sensed, touched = sensed_and_touched(record, arm, q, seen, q_touch)
+    return np.asarray(np.linalg.norm(sensed - touched, axis=1) / MM)
+
+
+def sensed_and_touched(
+    record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats
+) -> tuple[Floats, Floats]:
+    """Where points (n, 2) m are sensed, and where the tip touched them, both (n, 3) m in B."""
     X, touch = _flange(record, arm, q), _flange(record, arm, q_touch)
     assert record.tip is not None
     sensed = np.einsum("nij,nj->ni", X.rotation, record.points_F(seen)) + X.translation
-    return np.asarray(np.linalg.norm(sensed - touch.rotation @ record.tip - touch.translation, axis=1) / MM)
+    return np.asarray(sensed), np.asarray(touch.rotation @ record.tip + touch.translation)
 
 
 def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:

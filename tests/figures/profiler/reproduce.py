@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from tests.figures.harness import Missed, Row, Run, figure
-from tests.figures.profiler import papers
+from tests.figures.profiler import papers, table2
 from tests.figures.profiler.papers import (
     SEAM_FEATURES,
     SPHERE_METHODS,
@@ -23,6 +23,7 @@ from tests.figures.profiler.papers import (
     sphere_figures,
     sphere_targets,
 )
+from tests.figures.profiler.pictures import sphere_pictures
 from tests.worlds.edge_trials import (
     MM,
     NOISE,
@@ -266,8 +267,12 @@ def profiler(run: Run) -> None:
     run.table("", ("figure", "reached", "target", ""), rows)
     for title, header, lines in (*_edge_tables(edge), *_sphere_tables(sphere)):
         run.table(title, header, lines)
+    worlds = run.size(2, WORLDS)
+    varied = table2.rows(range(1000 * run.seed, 1000 * run.seed + worlds), run.progress)
+    run.table(f"Sphere paper, Table 2, compensated: what is varied, {worlds} worlds, mm", table2.HEADER, varied)
     if edge:
         pictures(run, edge)
+    sphere_pictures(run)
     if run.data is not None and any(missed):
         raise Missed(f"{sum(missed)} targets of the fixed files are missed; see the table.")
 

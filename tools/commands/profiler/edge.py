@@ -13,7 +13,7 @@ from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, beats, choose_sign, signs_to_try, with_sign
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
-from weldcal.calibration.profiler.edge.joint import OUTLIER, EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge.joint import OUTLIER, EdgeEstimate, edge_joint, with_sensor
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
@@ -21,6 +21,8 @@ from weldcal.calibration.profiler.plan import Field, plan_edge_poses, sample_edg
 from weldcal.calibration.profiler.reading_choice import edge_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.result import believed_covariance
+from weldcal.calibration.profiler.sensor import SensorCorrection
+from weldcal.calibration.profiler.sphere.model import corrected
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.files import Measurements
@@ -37,6 +39,7 @@ from weldcal.tools.commands.profiler.result import (
     next_poses,
     outcome_of,
     read_measurements,
+    stated_correction,
     widened,
     with_warnings,
 )
@@ -55,7 +58,7 @@ SIGMAS_MM = {"sigma-robot": 0.03, "sigma-x": 0.05, "sigma-z": 0.06}
 
 @command(
     "profiler edge",
-    keys=("robot-form", "set", "trial", "pitch", "side", "z", *SIGMAS_MM),
+    keys=("robot-form", "set", "trial", "pitch", "side", "z", "sensor-correction", *SIGMAS_MM),
     short_help="Calibrate by one straight edge.",
 )
 def edge(
@@ -77,13 +80,14 @@ def edge(
     if not sigmas.stated and "sigma" in data.arrays:
         r, x, depth = (float(v) for v in data.arrays["sigma"])
         sigmas = Sigmas(r, x, depth)
-    shown = edge_shown(data, sigmas, feature, call.reading.get("side", "left"), call.reading.get("z", ""))
+    sensor = stated_correction(call, data.profiles or [data.arrays.get("points", np.empty((0, 2)))])
+    shown = edge_shown(data, sigmas, feature, call.reading.get("side", "left"), call.reading.get("z", ""), sensor)
     record, found = calibrate_edge(shown, sigmas, method=method, plan=plan, seed=call.seed)
     data, held = shown.file, np.zeros(0)
     if "sigmas_mm" in found:  # the paper's method has no sigmas, and nothing is left out
         held = edge_held_out(*shown.seen(), found["sigmas_mm"])
     folder = call.folder("profiler", file.stem)
-    made, summary = finish(record, with_warnings(data, found), shown.seen()[1], held, file.name, folder, limit_mm)
+    made, summary = finish(record, with_warnings(data, found), shown.points, held, file.name, folder, limit_mm)
     return outcome_of(call, summary, made)
 
 
@@ -95,6 +99,7 @@ class EdgeShown:
         lost: numbers of the profiles without the edge.
         fit: the estimate by these points with its sigmas, where the choice of the sign made one.
         words: values of the JSON object on the sign of z.
+        sensor: the correction of the points, if there is one.
     """
 
     file: Measurements
@@ -102,6 +107,7 @@ class EdgeShown:
     lost: list[int] = field(default_factory=list)
     fit: tuple[EdgeEstimate, Sigmas] | None = None
     words: Mapping[str, str] = field(default_factory=dict)
+    sensor: SensorCorrection | None = None
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -109,20 +115,26 @@ class EdgeShown:
         return np.asarray(np.isfinite(self.points).all(axis=1), bool)
 
     def seen(self) -> tuple[FlangePoses, Floats]:
-        """Poses and points (k, 2) m of the profiles that show the edge."""
+        """Poses and corrected points (k, 2) m of the profiles that show the edge."""
         poses = cast(FlangePoses, self.file.poses())
         check_number(poses, self.points.shape, "profile points [x, z]", (2,))
-        return poses[self.keep], self.points[self.keep]
+        return poses[self.keep], self._corrected()
+
+    def _corrected(self) -> Floats:
+        p, sensor = self.points[self.keep], self.sensor
+        return p if sensor is None else corrected(p, sensor.values, sensor.origin)[:, [0, 2]]
 
     def decided(self) -> "EdgeShown":
         """Return the same with the reading of the poses that the edge selects."""
         if len(self.file.readings) < 2 or self.points.shape != (len(self.file.readings[0].X), 2):
             return self
-        keep, fit = self.keep, edge_fit(self.points[self.keep])
+        keep, fit = self.keep, edge_fit(self._corrected())
         return replace(self, file=self.file.decided(lambda poses: fit(poses[keep]), "edge"))
 
 
-def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: str) -> EdgeShown:
+def edge_shown(
+    file: Measurements, sigmas: Sigmas, feature: str, side: str, z: str, sensor: SensorCorrection | None = None
+) -> EdgeShown:
     """Return the points of the edge: the file's own, or those of the feature in its raw profiles.
 
     Of raw profiles each sign of z is tried that is not excluded by ``z``.
@@ -130,13 +142,14 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
     signs = signs_to_try(z)
     if not feature:
         why = "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
-        return EdgeShown(file=file, points=file.needed("points", why)).decided()
+        return EdgeShown(file=file, points=file.needed("points", why), sensor=sensor).decided()
     if feature not in FEATURES:
         raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
     if file.profiles is None:
         raise InputError("The file has no profiles to detect an edge in. Omit --feature.")
     total, other_side = len(file.profiles), "right" if side == "left" else "left"
-    tried = {grows: _tried(file, sigmas, feature, side, grows) for grows in signs}
+    blank = EdgeShown(file=file, points=np.full((total, 2), np.nan), sensor=sensor)
+    tried = {grows: _tried(blank, sigmas, feature, side, grows) for grows in signs}
     fits = {grows: fit for grows, (_, fit) in tried.items()}
     if total and not any(fit.shown for fit in fits.values()):
         other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
@@ -149,7 +162,7 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
     if not z and feature != "apex":
         # one jump is the end of the near face with one sign and side, and that of the far face with both exchanged
         opposite = next(sign for sign in signs if sign != grows)
-        twin, there = _tried(file, sigmas, feature, other_side, opposite)
+        twin, there = _tried(blank, sigmas, feature, other_side, opposite)
         if there.kept and not beats(fits[grows], there) and not _alike([tried[grows][0].fit, twin.fit]):
             raise InconsistentData(
                 f"The profiles do not show which face of the {feature} is near. With the near face on the {side} and z"
@@ -160,13 +173,12 @@ def edge_shown(file: Measurements, sigmas: Sigmas, feature: str, side: str, z: s
     return replace(tried[grows][0], words={"z_grows": WORDS[grows], "z_reason": reason})
 
 
-def _tried(file: Measurements, sigmas: Sigmas, feature: str, side: str, grows: str) -> tuple[EdgeShown, SignFit]:
+def _tried(blank: EdgeShown, sigmas: Sigmas, feature: str, side: str, grows: str) -> tuple[EdgeShown, SignFit]:
     """Return what the profiles show with one sign of z, and how far one edge explains it."""
-    profiles = file.profiles or ()
-    at, lost = with_sign(profiles, partial(_point, feature, side), grows)
-    points = np.full((len(profiles), 2), np.nan)
-    points[np.setdiff1d(np.arange(len(profiles)), lost)] = np.array(at).reshape(-1, 2)
-    one = EdgeShown(file=file, points=points, lost=lost)
+    at, lost = with_sign(blank.file.profiles or (), partial(_point, feature, side), grows)
+    points = blank.points.copy()
+    points[np.setdiff1d(np.arange(len(points)), lost)] = np.array(at).reshape(-1, 2)
+    one = replace(blank, points=points, lost=lost)
     try:
         one = one.decided()
         e, s = edge_by_noise(*one.seen(), sigmas)
@@ -210,6 +222,8 @@ def calibrate_edge(
                 f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and"
                 " check unit and poses."
             ]
+        if shown.sensor is not None:
+            raise InputError("The paper's method states no covariance and takes no sensor correction: omit it.")
         record = ProfilerRecord(
             method="edge, linear",
             rotation=linear.rotation,
@@ -219,7 +233,10 @@ def calibrate_edge(
         )
         return record, found
     e, sigmas = shown.fit or edge_by_noise(poses, points, sigmas)
-    e, xz = widened(e), np.array([sigmas.x_m, sigmas.z_m])
+    e, xz, sensor = widened(e), np.array([sigmas.x_m, sigmas.z_m]), shown.sensor
+    if sensor is not None:
+        C = with_sensor(e, sensor, poses, shown.points[keep], sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz)
+        e, found["sensor_correction"] = replace(e, covariance=C), sensor.data_sha256
     found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
     found |= figures_of(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
@@ -233,7 +250,8 @@ def calibrate_edge(
             state, poses[e.inliers], candidates, plan, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz, field=field
         )
         found["next_poses"] = next_poses(candidates, chosen.chosen, chosen.rms_m)
-    return ProfilerRecord.of("edge, joint", e, found, file.digest), found
+    record = ProfilerRecord.of("edge, joint", e, found, file.digest)
+    return record if sensor is None else replace(record, affine=sensor.values, origin=sensor.origin), found
 
 
 def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[EdgeEstimate, Sigmas]:

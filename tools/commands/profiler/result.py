@@ -1,6 +1,6 @@
 """Hold what `edge`, `sphere` and `compensate` share: options, sigmas, and the files of a calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -15,6 +15,7 @@ from weldcal.calibration.profiler.edge.joint import EdgeEstimate
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
+from weldcal.calibration.profiler.sensor import SensorCorrection, load_correction
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.models.errors import InputError
 from weldcal.tools import console
@@ -45,6 +46,15 @@ def read_measurements(call: Call, file: Path, unit: str | None, poses: Path | No
     stated = PosesStated(poses, call.reading.get("robot-form", ""), call.reading.get("pitch"))
     known = {"dataset": call.reading.get("set", ""), "trial": call.reading.get("trial")}
     return read_profiler_file(file, unit=unit, **known, stated=stated, posed=posed)
+
+
+def stated_correction(call: Call, profiles: Sequence[Floats]) -> SensorCorrection | None:
+    """Return the sensor correction that --as states, if it is of the sensor of these profiles; None without it."""
+    if "sensor-correction" not in call.reading:
+        return None
+    correction = load_correction(call.reading["sensor-correction"])
+    correction.require_same_sensor(profiles)
+    return correction
 
 
 def with_warnings(data: Measurements, found: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,12 +6,13 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 
-from weldcal.calibration.errors import ArcNotFound
+from weldcal.calibration.errors import ArcNotFound, InconsistentData
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import Field, plan_sphere_poses, sample_sphere_poses
 from weldcal.calibration.profiler.reading_choice import sphere_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.sensor import SensorCorrection
 from weldcal.calibration.profiler.sphere import linear as published
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.sphere.joint import (
@@ -45,6 +46,7 @@ from weldcal.tools.commands.profiler.result import (
     next_poses,
     outcome_of,
     read_measurements,
+    stated_correction,
     widened,
     with_warnings,
 )
@@ -53,6 +55,7 @@ from weldcal.tools.report.profiler_file import ProfilerFile
 
 POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
 RADIUS_OFF_M = 0.1e-3
+OTHER_SIGMAS, OTHER_SENSOR = 5.0, 0.01  # a choice: an arm's errors look like 0.5 % of scale
 _LONGEST_TORCH_M = 10.0
 ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
 MODELS = ("auto", "rigid", "affine", "affine+joints")
@@ -60,7 +63,7 @@ MODELS = ("auto", "rigid", "affine", "affine+joints")
 
 @command(
     "profiler sphere",
-    keys=("robot-form", "set", "trial", "pitch", "sigma-robot", "sigma-z"),
+    keys=("robot-form", "set", "trial", "pitch", "sensor-correction", "sigma-robot", "sigma-z"),
     short_help="Calibrate by a sphere, with or without touches of it.",
 )
 def sphere(
@@ -83,6 +86,7 @@ def sphere(
     sigmas = Sigmas(robot_m, z_m, z_m)
     lost: list[int] = []
     data, measured = read_sphere(call, file, unit, poses, radius, touches, tip, arm, lost)
+    measured = replace(measured, sensor=stated_correction(call, measured.profiles))
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
     made, summary = finish_sphere(
         measured,
@@ -220,7 +224,7 @@ def calibrate_sphere(
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
-    scans = SphereData(poses=data.poses, profiles=data.profiles, radius_m=data.radius_m)
+    scans = data.scans(data.radius_m)
     rigid = _rigid(scans, s)
     check_radius(scans, s, rigid)
     _refuse_inverse_poses(scans, rigid, s)
@@ -232,6 +236,9 @@ def calibrate_sphere(
         found["left_out_rms_mm"] = {name: 1e3 * v for name, v in choice.left_out_m.items()}
         found["model_reason"] = choice.reason
     e = widened(sphere_joint(data, chosen, s))
+    if data.sensor is not None:
+        _refuse_other_sensor(data, data.sensor, s, e)
+        found["sensor_correction"] = data.sensor.data_sha256
     found |= {"model": chosen} | figures_of(e)
     found["wrong_scans"] = list(e.wrong_poses)
     # to first order, and so only where it is near the stated one
@@ -254,6 +261,24 @@ def calibrate_sphere(
         found["next_poses"] = next_poses(candidates, best.chosen, best.rms_m)
     arm = data.arm if chosen == "affine+joints" else None
     return ProfilerRecord.of(f"sphere, {chosen}", e, found, digest, arm), found
+
+
+def _refuse_other_sensor(data: SphereData, sensor: SensorCorrection, s: SphereSigmas, e: SphereEstimate) -> None:
+    """Refuse a sensor correction that the sphere contradicts.
+
+    Raises:
+        InconsistentData: the sphere alone shows clearly other scales.
+    """
+    free = sphere_joint(replace(_without_arm(data), sensor=None), "affine", s, init=replace(e, affine=np.zeros(3)))
+    k = 9 + 3 * (data.touches is not None)
+    spread = sensor.covariance + free.whole[k : k + 3, k : k + 3] * max(1.0, free.reduced_chi2, free.scans_chi2)
+    off = np.abs(free.affine - sensor.values)
+    if ((off > OTHER_SIGMAS * np.sqrt(np.diag(spread))) & (off > OTHER_SENSOR)).any():
+        mine, theirs = (", ".join(f"{100.0 * v:+.2f} %" for v in a) for a in (free.affine, sensor.values))
+        raise InconsistentData(
+            f"The sphere shows x scale, z scale and shear of {mine}, and the sensor correction states {theirs}: it is"
+            " another sensor's. Run 'weldcal profiler step' with this sensor, or omit the correction."
+        )
 
 
 def _refuse_inverse_poses(scans: SphereData, rigid: SphereEstimate | None, s: SphereSigmas) -> None:
@@ -299,9 +324,7 @@ def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]
 
 
 def _without_arm(data: SphereData) -> SphereData:
-    return SphereData(
-        poses=data.poses, profiles=data.profiles, radius_m=data.radius_m, touches=data.touches, tip=data.tip
-    )
+    return replace(data, arm=None, q=None, touch_q=None)
 
 
 def finish_sphere(
