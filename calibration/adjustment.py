@@ -1,4 +1,4 @@
-"""Adjusts poses and numbers to several kinds of observations, each with a robust loss and a spread of its own."""
+"""Adjusts poses and numbers to several kinds of observations with losses and spreads, and chooses observations."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ def likeliest(left: Remainder) -> float:
 
 
 def by_median(left: Remainder) -> float:
-    """By the median length of residuals (n, 3)."""
-    return float(np.median(np.linalg.norm(left.e, axis=1))) / _MEDIAN
+    """By the median length of residuals (n, 3); 0 of none."""
+    return float(np.median(np.linalg.norm(left.e, axis=1))) / _MEDIAN if len(left.e) else 0.0
 
 
 def adjust(
@@ -204,6 +204,37 @@ def adjust(
     return Adjusted(
         at=at, information=N, of=tuple(parts), covariance=V, sigmas=tuple(sigmas), spare=tuple(spare), rows=seen
     )
+
+
+def most_informative(
+    known: Array,
+    gains: Array,
+    n: int,
+    value: Callable[[Array], Array],
+    allowed: Callable[[list[int]], Array] | None = None,
+) -> tuple[list[int], list[float]]:
+    """Choose observations, each the one that raises a value of the information most (Atkinson, Donev and Tobias 2007).
+
+    Args:
+        known: information (m, m) before. gains: what each of k observations adds (k, m, m). n: how many to choose.
+        value: of informations (j, m, m), (j,). allowed: which (k,) may follow those chosen; None: all others.
+
+    Returns:
+        Indices of at most n observations in their order, and the value with each.
+    """
+    chosen: list[int] = []
+    values: list[float] = []
+    free = np.ones(len(gains), dtype=bool)
+    while len(chosen) < n:
+        left = np.flatnonzero(free if allowed is None else free & allowed(chosen))
+        if not left.size:
+            break
+        each = value(known + gains[left])
+        best = int(left[np.argmax(each)])
+        known, free[best] = known + gains[best], False
+        chosen.append(best)
+        values.append(float(each.max()))
+    return chosen, values
 
 
 def scanned(X: Array, c: Array, basis: Array, factors: Array) -> tuple[Array, Array, Array]:

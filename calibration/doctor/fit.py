@@ -15,15 +15,15 @@ from scipy.special import gammaln
 
 from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, likeliest, scanned
 from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.geometry.se3 import drawn_triples, fit_rigid, fit_rigid_sets, pose, skew
+from weldcal.calibration.eye_on_base.solve import SolveConfig, robust_start
+from weldcal.calibration.geometry.se3 import pose, skew
 from weldcal.models.arrays import Array
 
 NU = 6.0  # degrees of freedom of Student's t, a choice between heavy tails (3) and normal noise (30)
 FLOOR_M, FLOOR_RAD = 2e-5, 3e-4  # below any arm and scanner
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 2e-2])  # what scanners err: scale, and its gradients over x, y and z (1/m)
 _STEPS = 25
-_TRIPLES = 300
-_BEST = 0.6  # share of the scans that the start must explain
+_START = SolveConfig(hypotheses=300)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,30 +62,6 @@ class CauseFit:
         return float(-2.0 * self.loglik + self.size * np.log(count) * few + self.occam)
 
 
-def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
-    """Rotation (3, 3) and position (3,) that explain most of the centres.
-
-    Least trimmed squares over seeded triples.
-    """
-    n = len(b)
-    sets = drawn_triples(n, _TRIPLES if n > 3 else 1, seed)
-    R, t = fit_rigid_sets(b[sets], c[sets])
-    if len(R) == 0:
-        return np.eye(3), np.asarray(b.mean(axis=0) - c.mean(axis=0))
-    square = ((np.einsum("kij,nj->kni", R, c) + t[:, None] - b) ** 2).sum(axis=2)
-    h = max(3, int(np.ceil(_BEST * n)))
-    k = int(np.argmin(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1)))
-    best_R, best_t = R[k], t[k]
-    for _ in range(5):
-        near = np.argsort(((c @ best_R.T + best_t - b) ** 2).sum(axis=1))[:h]
-        try:
-            X = fit_rigid(b[near], c[near])
-        except ValueError:
-            break
-        best_R, best_t = X.rotation().matrix(), np.asarray(X.translation())
-    return np.asarray(best_R), np.asarray(best_t)
-
-
 def fit(
     case: DoctorCase,
     *,
@@ -117,10 +93,9 @@ def fit(
     m = np.where(has[:, None], case.m, 0.0)
     terms = np.column_stack([np.ones(n), c - c.mean(axis=0)])
     if start is not None and len(start.R) == G:
-        first = start.R, start.p
+        first = tuple(pose(R, p) for R, p in zip(start.R, start.p, strict=True))
     else:
-        poses = [start_pose(b[g == k], c[g == k]) for k in range(G)]
-        first = np.array([one[0] for one in poses]), np.array([one[1] for one in poses])
+        first = tuple(np.asarray(robust_start(b[g == k], c[g == k], _START).GetAsMatrix4()) for k in range(G))
     at_a, size = 6 * G + 4, 6 * G + 4 + p
 
     def normals_at(at: Unknowns) -> tuple[Array, Array, Array]:
@@ -137,7 +112,7 @@ def fit(
         s, a = at.numbers[:4], at.numbers[4:]
         q, J, Jn = np.zeros((n, 3)), np.zeros((n, 3, size)), np.zeros((n, 3, size))
         u, z, en = normals_at(at)
-        turned = _cross_change(u, z)
+        turned = skew(z) @ skew(u)  # change of u x z by a rotation of u
         for k, X in enumerate(at.poses):
             own, block = g == k, slice(6 * k, 6 * k + 6)
             q[own], J[own, :, block], J[own, :, 6 * G : at_a] = scanned(X, c[own], terms[own], s)
@@ -145,14 +120,12 @@ def fit(
         J[:, :, at_a:], Jn[:, :, at_a:] = D, skew(u) @ T
         return Observed(q - b + D @ a, J), Observed(en[has], Jn[has])
 
-    start_at = Unknowns(tuple(pose(R, t) for R, t in zip(*first, strict=True)), np.zeros(4 + p))
-    e, en = (rows.e for rows in linearised(start_at))
     found = adjust(
-        start_at,
+        Unknowns(first, np.zeros(4 + p)),
         linearised,
         (
-            Kind(rank=3, loss=_student, spread=likeliest, sigma=max(_middle(e) / 1.54, 1e-4), floor=FLOOR_M),
-            Kind(rank=2, loss=_student, spread=likeliest, sigma=max(_middle(en) / 1.18, 1e-3), floor=FLOOR_RAD),
+            Kind(rank=3, loss=_student, spread=likeliest, floor=FLOOR_M),
+            Kind(rank=2, loss=_student, spread=likeliest, floor=FLOOR_RAD),
         ),
         prior=np.diag(np.concatenate([1.0 / _USUAL, weak]) ** 2),
         steps=_STEPS,
@@ -184,11 +157,6 @@ def fit(
     )
 
 
-def _middle(e: Array) -> float:
-    """Median length of residuals (n, 3); 0 of none."""
-    return float(np.median(np.linalg.norm(e, axis=1))) if len(e) else 0.0
-
-
 def _student(square: Array, rank: float) -> Array:
     """Weights of Student's t (Lange, Little and Taylor 1989)."""
     return np.asarray((NU + rank) / (NU + square))
@@ -202,11 +170,6 @@ def _narrowed(H: Array, held: NDArray[np.bool_], sigma: Array) -> float:
     cross = H[np.ix_(~held, held)]
     kept = H[np.ix_(held, held)] - cross.T @ np.linalg.lstsq(H[np.ix_(~held, ~held)], cross, rcond=1e-12)[0]
     return float(np.linalg.slogdet(kept * np.outer(sigma, sigma))[1])
-
-
-def _cross_change(u: Array, z: Array) -> Array:
-    """Change (n, 3, 3) of u x z by a rotation of u."""
-    return np.asarray(skew(z) @ skew(u))
 
 
 def student(r: Array, sigma: float, d: int) -> float:

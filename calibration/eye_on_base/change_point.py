@@ -21,6 +21,7 @@ from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_tail
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -35,7 +36,6 @@ _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 0.02, 0.02, 0.02])  # what the factors 
 _CANDIDATES = 60  # places looked at first
 _FINER = 10  # times finer are the places near the best
 _SAME_M, _SAME_RAD = 5e-3, 1e-2  # starts so near to each other lead to the same fit
-_FLOOR_M = 1e-6  # as in solve.py: below any scanner or arm, keeps exact data from dividing by zero
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -161,8 +161,7 @@ def _fit(
     ``sigma`` (m, an axis) is estimated from the residuals where it is not given.
     """
     n, terms = len(b), TERMS[order]
-    correction = ScannerCorrection(1.0, (0.0, 0.0), (0.0,) * (terms - 3))
-    basis = correction.terms(c)
+    basis = ScannerCorrection.unchanged(terms).terms(c)
     poses = 1 if split is None else 2
     free = max(3 * n - 6 * poses - terms, 3)
 
@@ -179,14 +178,13 @@ def _fit(
     found = adjust(
         Unknowns((np.asarray(start.GetAsMatrix4()),) * poses, np.zeros(terms)),
         linearised,
-        (Kind(rank=3, loss=huber, spread=spread if sigma is None else None, sigma=sigma, floor=_FLOOR_M),),
+        (Kind(rank=3, loss=huber, spread=spread if sigma is None else None, sigma=sigma),),
         prior=np.diag(_USUAL[:terms] ** -2),
         steps=12,
     )
     e, scale = found.rows[0].e, found.sigmas[0]
-    own = max(spread(Remainder(e)), _FLOOR_M)
     square = (e**2).sum(axis=1) / scale**2
     loss = float(huber_cost(square, 3).sum() + ((found.at.numbers / _USUAL[:terms]) ** 2).sum())
-    rigid = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in found.at.poses]
+    rigid = [as_transform(X) for X in found.at.poses]
     value = loss if sigma is not None else float(np.log(scale) * 3 * n + loss)
-    return _Split(rigid[0], rigid[-1], value, scale, own)
+    return _Split(rigid[0], rigid[-1], value, scale, spread(Remainder(e)))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.adjustment import Kind, Observed, Remainder, Unknowns, adjust, scanned, soft_l1
 from weldcal.calibration.data.scanner_correction import (
@@ -20,7 +20,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import MAD, chi2_share
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.se3 import as_transform, skew
 from weldcal.models.arrays import Array
 
 LEAST_PATTERNS = 6
@@ -157,13 +157,12 @@ def from_motion(
         ),
         prior=np.diag(prior[6:] ** 2),
     )
-    X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(found.at.poses[0][:3, :3]), found.at.poses[0][:3, 3])
     joint = found.covariance[: 6 + terms, : 6 + terms]
     change, (sigma_p, sigma_n, _) = found.at.numbers, found.sigmas
     return CorrectionEstimate(
         correction=correction_of(change[:terms], field),
         covariance=joint[6:, 6:],
-        X_BC=X_BC,
+        X_BC=as_transform(found.at.poses[0]),
         joint=joint,
         redundancy=found.spare[0],
         sigma_position_m=float(sigma_p),

@@ -184,6 +184,13 @@ def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
     return _distances(data, X_BC), np.where(data.has, tilt, np.nan)
 
 
+def robust_start(b: Array, c: Array, config: SolveConfig) -> RigidTransform:
+    """Return the camera pose that explains most of n centres: b (n, 3) in the base, c (n, 3) in the camera, m."""
+    n, none = len(b), np.zeros((len(b), 3))
+    unknown = _Data(b=b, c=c, z=none, m=none, has=np.zeros(n, bool), cov=np.zeros((n, 3, 3)), var_n=np.zeros(n))
+    return _robust_start(unknown, config)
+
+
 def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     """Best of seeded minimal sets, each concentrated twice (least trimmed squares, Rousseeuw and Van Driessen 1999)."""
     if len(data.b) > _START_POSES:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, by_median, plain, scanned, soft_l1
+from weldcal.calibration.eye_on_base.solve import SolveConfig, robust_start
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import as_transform, fit_rigid, fit_with_offset
+from weldcal.calibration.geometry.se3 import as_transform, fit_with_offset
 from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
@@ -105,7 +106,8 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
     if n < 5 or 3 * n - 9 - terms < _LEAST_FREE:
         return None
     data = _Data.of(observations, order)
-    starts = [one for one in (start, _linear_start(data), _rigid_start(data)) if one is not None]
+    rigid = robust_start(data.b, data.c, SolveConfig(hypotheses=300))
+    starts = [one for one in (start, _linear_start(data), rigid) if one is not None]
     fitted = [_fit(data, one, offset=True) for one in starts]
     best = min(fitted, key=lambda one: float(np.median(one.norms)))
     scale = float(np.median(best.norms)) / 1.5382  # of the chi distribution with three free
@@ -217,10 +219,3 @@ def _linear_start(data: _Data) -> RigidTransform | None:
         return None
     R, p, _ = fit_with_offset(data.b, data.c, data.R)
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-
-
-def _rigid_start(data: _Data) -> RigidTransform | None:
-    try:
-        return fit_rigid(data.b, data.c)
-    except ValueError:
-        return None
