@@ -191,11 +191,7 @@ def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = Tru
             J[:, :, 6 + K :], b = -data.R, at.numbers[K:]
         return (Observed((q - data.b - data.R @ b) * data.weight[:, None], J * data.weight[:, None, None]),)
 
-    kind = (
-        Kind(rank=3, loss=soft_l1, spread=by_median, floor=1e-9)  # m: no division by zero
-        if robust
-        else Kind(rank=3, loss=plain, sigma=_USUAL_SPREAD_M)
-    )
+    kind = Kind(rank=3, loss=soft_l1 if robust else plain, spread=by_median if robust else None)
     found = adjust(Unknowns((np.asarray(start.GetAsMatrix4()),), np.zeros(size - 6)), linearised, (kind,))
     e, J = found.rows[0].e, found.rows[0].J.reshape(-1, size)
     unit = np.maximum(np.linalg.norm(J, axis=0), 1e-12)  # no division by zero
