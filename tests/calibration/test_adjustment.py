@@ -16,6 +16,7 @@ from weldcal.calibration.adjustment import (
     adjust,
     helmert,
     huber,
+    huber_cost,
     likeliest,
     plain,
     scanned,
@@ -124,11 +125,14 @@ def test_kinds_are_weighed_by_their_own_spread() -> None:
     assert 0.002 < np.median(gained) < 0.05
 
 
-def test_what_is_known_of_an_observation_lowers_its_weight() -> None:
+@pytest.mark.parametrize("width", [1, 3])
+def test_what_is_known_of_an_observation_lowers_its_weight(width: int) -> None:
     c, b = world(12, np.random.default_rng(7), 1e-4)
     b[3] += 0.05
     own = np.zeros(12)
     own[3] = 1.0
+    if width == 3:
+        own = own[:, None, None] * np.eye(3)
 
     def rows(at: Unknowns) -> tuple[Observed]:
         q, J_X, J_s = scanned(at.poses[0], c, np.ones((len(c), 1)), at.numbers)
@@ -147,5 +151,12 @@ def test_an_open_direction_does_not_run_away() -> None:
     axis = X[:3, :3] @ np.array([0.3, 0.1, 1.0])
     assert np.isfinite(found.at.poses[0]).all()
     assert np.abs(found.rows[0].e).max() < 1e-9
+    assert np.diag(found.covariance).max() < 1.0
     about = Rotation.from_matrix(found.at.poses[0][:3, :3] @ X[:3, :3].T).as_rotvec() @ axis / np.linalg.norm(axis)
     assert about == pytest.approx(NEAR[:3] @ axis / np.linalg.norm(axis), abs=0.05)
+
+
+def test_the_cost_of_huber_has_his_weights_for_its_slope() -> None:
+    for square in (0.5, 11.9, 12.1, 80.0):
+        slope = (huber_cost(np.array([square + 1e-5]), 3.0) - huber_cost(np.array([square - 1e-5]), 3.0)) / 2e-5
+        assert slope == pytest.approx(huber(np.array([square]), 3.0), rel=1e-4)
