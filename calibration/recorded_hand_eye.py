@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.bag import at_rest
 from weldcal.calibration.data.poses.listing import listing_of_array
 from weldcal.calibration.data.poses.lists import folder_lists, two_lists
 from weldcal.calibration.data.poses.names import mounting_name
@@ -20,7 +21,7 @@ from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, with_scale
 from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
-from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs, recorded_lists
 from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
@@ -255,12 +256,15 @@ def _apply_corners(
 
 def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
     """Return the pairs of two recordings in motion of a folder; None where it holds none."""
-    if not path.is_dir() or (path / "pairs.npz").exists():
+    lists = recorded = recorded_lists(path, stated)
+    if lists is None and (not path.is_dir() or (path / "pairs.npz").exists()):
         return None
     try:
-        lists = two_lists(folder_lists(path), path.name, stated.robot_poses, stated.camera_poses)
+        lists = lists or two_lists(folder_lists(path), path.name, stated.robot_poses, stated.camera_poses)
     except InputError:
         return None  # the reader of pairs says what is wrong
+    if recorded is not None and at_rest(*recorded) is not None:
+        return None
     if not pose_streams.are_trajectories(*lists):
         return None
     forms = (stated.robot, stated.camera)

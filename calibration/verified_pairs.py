@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from weldcal.calibration.data.clouds import NO_NOTES
-from weldcal.calibration.data.poses.bag import find_bag
+from weldcal.calibration.data.poses.bag import has_clouds
 from weldcal.calibration.data.poses.source import FOLDERS
 from weldcal.calibration.data.stated_pose import StatedPose, read_stated_pose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
@@ -26,10 +26,10 @@ _MOUNTINGS = ("eye_in_hand", "eye_on_base")
 def holds_scans(path: Path) -> bool:
     """Find whether a path holds scans of a flange, not pairs of poses: clouds, pairs.csv of centres, a recording."""
     if path.is_file():
-        return find_bag(path) is not None
+        return has_clouds(path)
     if not path.is_dir():
         return True  # its reader says that it does not exist
-    if (path / "pairs.csv").is_file() or find_bag(path) is not None:
+    if (path / "pairs.csv").is_file() or has_clouds(path):
         return True
     if (path / "pairs.npz").is_file():
         return False

@@ -189,11 +189,18 @@ def pose_document(X: RigidTransform) -> dict[str, Any]:
 
 
 def pose_of_document(section: DocumentSection, refusal: str) -> RigidTransform:
-    """The pose of a document's ``matrix``. Raises InputError with the sentence ``refusal`` where it is not rigid."""
+    """The pose of a document's ``matrix``.
+
+    Raises InputError with the sentence ``refusal`` where it is not rigid, and where ``xyz`` or ``wxyz`` is another pose.
+    """
     M = section.array("matrix", 4, 4)
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
         raise InputError(refusal)
-    return as_transform(M)
+    X = as_transform(M)
+    for key, own in list(pose_document(X).items())[1:]:
+        if section.has(key) and not np.allclose(section.array(key, len(own)), own, atol=1e-5):  # five printed decimals
+            raise InputError(f"'{section.file}': {section.place}.matrix and {section.place}.{key} differ: change both.")
+    return X
 
 
 def save_result(result: CalibrationResult, folder: Path) -> Path:

@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, likeliest, scanned
 from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.geometry.se3 import drawn_triples, exp_rotation, fit_rigid, fit_rigid_sets, skew
+from weldcal.calibration.eye_on_base.solve import SolveConfig, robust_start
+from weldcal.calibration.geometry.se3 import pose, skew
 from weldcal.models.arrays import Array
 
 NU = 6.0  # degrees of freedom of Student's t, a choice between heavy tails (3) and normal noise (30)
 FLOOR_M, FLOOR_RAD = 2e-5, 3e-4  # below any arm and scanner
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 2e-2])  # what scanners err: scale, and its gradients over x, y and z (1/m)
 _STEPS = 25
-_TRIPLES = 300
-_BEST = 0.6  # share of the scans that the start must explain
+_START = SolveConfig(hypotheses=300)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,30 +62,6 @@ class CauseFit:
         return float(-2.0 * self.loglik + self.size * np.log(count) * few + self.occam)
 
 
-def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
-    """Rotation (3, 3) and position (3,) that explain most of the centres.
-
-    Least trimmed squares over seeded triples.
-    """
-    n = len(b)
-    sets = drawn_triples(n, _TRIPLES if n > 3 else 1, seed)
-    R, t = fit_rigid_sets(b[sets], c[sets])
-    if len(R) == 0:
-        return np.eye(3), np.asarray(b.mean(axis=0) - c.mean(axis=0))
-    square = ((np.einsum("kij,nj->kni", R, c) + t[:, None] - b) ** 2).sum(axis=2)
-    h = max(3, int(np.ceil(_BEST * n)))
-    k = int(np.argmin(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1)))
-    best_R, best_t = R[k], t[k]
-    for _ in range(5):
-        near = np.argsort(((c @ best_R.T + best_t - b) ** 2).sum(axis=1))[:h]
-        try:
-            X = fit_rigid(b[near], c[near])
-        except ValueError:
-            break
-        best_R, best_t = X.rotation().matrix(), np.asarray(X.translation())
-    return np.asarray(best_R), np.asarray(best_t)
-
-
 def fit(
     case: DoctorCase,
     *,
@@ -114,82 +91,59 @@ def fit(
     weak = np.where(held, 1.0 / sigmas, 0.0)
     has: NDArray[np.bool_] = np.isfinite(case.m).all(axis=1) & np.full(n, normals)
     m = np.where(has[:, None], case.m, 0.0)
-    z = stated = case.z
     terms = np.column_stack([np.ones(n), c - c.mean(axis=0)])
     if start is not None and len(start.R) == G:
-        R, t = start.R.copy(), start.p.copy()
+        first = tuple(pose(R, p) for R, p in zip(start.R, start.p, strict=True))
     else:
-        poses = [start_pose(b[g == k], c[g == k]) for k in range(G)]
-        R, t = np.array([one[0] for one in poses]), np.array([one[1] for one in poses])
-    s, a = np.zeros(4), np.zeros(p)
-    sigma, sigma_n = 1e-3, 3e-3
-    size = 6 * G + 4 + p
-    e, en = np.zeros((n, 3)), np.zeros((n, 3))
-    rows = np.zeros((0, size))
-    for step in range(_STEPS):
-        q = np.einsum("kij,kj->ki", R[g], c * (1.0 + terms @ s)[:, None])
-        u = np.einsum("kij,kj->ki", R[g], m)
-        z = stated + T @ a
+        first = tuple(np.asarray(robust_start(b[g == k], c[g == k], _START).GetAsMatrix4()) for k in range(G))
+    at_a, size = 6 * G + 4, 6 * G + 4 + p
+
+    def normals_at(at: Unknowns) -> tuple[Array, Array, Array]:
+        """Measured u (n, 3) and expected normals z (n, 3) in the base; what lies between them (n, 3)."""
+        u = np.einsum("kij,kj->ki", np.array(at.poses)[g, :3, :3], m)
+        z = case.z + T @ at.numbers[4:]
         z = z / np.linalg.norm(z, axis=1)[:, None]
-        e, en = q + t[g] - b + D @ a, np.where(has[:, None], np.cross(u, z), 0.0)
-        backward = has & ((u * z).sum(axis=1) < 0.0)
-        en[backward] /= np.maximum(np.linalg.norm(en[backward], axis=1), 1e-9)[:, None]
-        r2, rn2 = (e**2).sum(axis=1), (en**2).sum(axis=1)
-        if step == 0:
-            sigma = max(float(np.median(np.sqrt(r2))) / 1.54, 1e-4)
-            sigma_n = max(float(np.median(np.sqrt(rn2[has]))) / 1.18, 1e-3) if has.any() else 1.0
-        w = (NU + 3.0) / (NU + r2 / sigma**2)
-        wn = np.where(has, (NU + 2.0) / (NU + rn2 / sigma_n**2), 0.0)
-        new = max(float(np.sqrt((w * r2).sum() / (3.0 * n))), FLOOR_M)
-        new_n = max(float(np.sqrt((wn * rn2).sum() / max(2.0 * has.sum(), 1.0))), FLOOR_RAD)
-        done = step > 3 and abs(new / sigma - 1.0) < 1e-4 and abs(new_n / sigma_n - 1.0) < 1e-3
-        sigma, sigma_n = new, new_n
-        if done:
-            break
-        J, Jn = np.zeros((n, 3, size)), np.zeros((n, 3, size))
-        S, Sn = -skew(q), _cross_change(u, z)
-        for k in range(G):
-            own = g == k
-            J[own, :, 6 * k : 6 * k + 3], J[own, :, 6 * k + 3 : 6 * k + 6] = S[own], np.eye(3)
-            Jn[own, :, 6 * k : 6 * k + 3] = Sn[own]
-        at = 6 * G
-        J[:, :, at : at + 4] = np.einsum("kij,kj->ki", R[g], c)[:, :, None] * terms[:, None]
-        J[:, :, at + 4 :] = D
-        Jn[:, :, at + 4 :] = np.einsum("kij,kjp->kip", skew(u), T)
-        rows = np.concatenate(
-            [
-                (J * (np.sqrt(w) / sigma)[:, None, None]).reshape(-1, size),
-                (Jn * (np.sqrt(wn) / sigma_n)[:, None, None]).reshape(-1, size)[np.repeat(has, 3)],
-                np.eye(size)[at : at + 4] / _USUAL[:, None],
-                np.eye(size)[at + 4 :] * weak[:, None],
-            ]
-        )
-        left = np.concatenate(
-            [
-                (e * (np.sqrt(w) / sigma)[:, None]).ravel(),
-                (en * (np.sqrt(wn) / sigma_n)[:, None]).ravel()[np.repeat(has, 3)],
-                s / _USUAL,
-                a * weak,
-            ]
-        )
-        unit = np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
-        x = -np.linalg.lstsq(rows / unit, left, rcond=1e-7)[0] / unit
-        for k in range(G):
-            R[k] = exp_rotation(x[6 * k : 6 * k + 3]) @ R[k]
-            t[k] = t[k] + x[6 * k + 3 : 6 * k + 6]
-        s, a = s + x[at : at + 4], a + x[at + 4 :]
+        e = np.cross(u, z)
+        backward = (u * z).sum(axis=1) < 0.0
+        e[backward] /= np.maximum(np.linalg.norm(e[backward], axis=1), 1e-9)[:, None]  # no division by zero
+        return u, z, e
+
+    def linearised(at: Unknowns) -> tuple[Observed, Observed]:
+        s, a = at.numbers[:4], at.numbers[4:]
+        q, J, Jn = np.zeros((n, 3)), np.zeros((n, 3, size)), np.zeros((n, 3, size))
+        u, z, en = normals_at(at)
+        turned = skew(z) @ skew(u)  # change of u x z by a rotation of u
+        for k, X in enumerate(at.poses):
+            own, block = g == k, slice(6 * k, 6 * k + 6)
+            q[own], J[own, :, block], J[own, :, 6 * G : at_a] = scanned(X, c[own], terms[own], s)
+            Jn[own, :, 6 * k : 6 * k + 3] = turned[own]
+        J[:, :, at_a:], Jn[:, :, at_a:] = D, skew(u) @ T
+        return Observed(q - b + D @ a, J), Observed(en[has], Jn[has])
+
+    found = adjust(
+        Unknowns(first, np.zeros(4 + p)),
+        linearised,
+        (
+            Kind(rank=3, loss=_student, spread=likeliest, floor=FLOOR_M),
+            Kind(rank=2, loss=_student, spread=likeliest, floor=FLOOR_RAD),
+        ),
+        prior=np.diag(np.concatenate([1.0 / _USUAL, weak]) ** 2),
+        steps=_STEPS,
+    )
+    (sigma, sigma_n), s, a = found.sigmas, found.at.numbers[:4], found.at.numbers[4:]
+    e, (u, z, _) = linearised(found.at)[0].e, normals_at(found.at)
     tilt = np.where(has, np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1)), np.nan)
     loglik = student(np.sqrt((e**2).sum(axis=1)), sigma, 3) - 0.5 * float(((s / _USUAL) ** 2).sum())
     if has.any():
         loglik += student(tilt[has], sigma_n, 2)
     free = 6 * G + int(np.count_nonzero(~held))
     loglik -= 0.5 * float(((a * weak) ** 2).sum())
-    occam = (
-        _narrowed(rows, np.concatenate([np.zeros(6 * G + 4, dtype=bool), held]), sigmas[held]) if held.any() else 0.0
-    )
+    occam = 0.0
+    if held.any():
+        occam = _narrowed(found.information, np.concatenate([np.zeros(at_a, dtype=bool), held]), sigmas[held])
     return CauseFit(
-        R=R,
-        p=t,
+        R=np.array([X[:3, :3] for X in found.at.poses]),
+        p=np.array([X[:3, 3] for X in found.at.poses]),
         scanner=s,
         a=a[:own_numbers],
         e=e,
@@ -203,20 +157,19 @@ def fit(
     )
 
 
-def _narrowed(rows: Array, held: NDArray[np.bool_], sigma: Array) -> float:
-    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free.
+def _student(square: Array, rank: float) -> Array:
+    """Weights of Student's t (Lange, Little and Taylor 1989)."""
+    return np.asarray((NU + rank) / (NU + square))
+
+
+def _narrowed(H: Array, held: NDArray[np.bool_], sigma: Array) -> float:
+    """Logarithm of how much information H (m, m) narrows the numbers that a prior holds, all others free.
 
     Twice Laplace's factor.
     """
-    H = rows.T @ rows
     cross = H[np.ix_(~held, held)]
     kept = H[np.ix_(held, held)] - cross.T @ np.linalg.lstsq(H[np.ix_(~held, ~held)], cross, rcond=1e-12)[0]
     return float(np.linalg.slogdet(kept * np.outer(sigma, sigma))[1])
-
-
-def _cross_change(u: Array, z: Array) -> Array:
-    """Change (n, 3, 3) of u x z by a rotation of u."""
-    return np.asarray(skew(z) @ skew(u))
 
 
 def student(r: Array, sigma: float, d: int) -> float:

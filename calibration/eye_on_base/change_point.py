@@ -6,11 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.adjustment import (
+    Kind,
+    Observed,
+    Remainder,
+    Unknowns,
+    adjust,
+    by_median,
+    huber,
+    huber_cost,
+    scanned,
+)
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -25,8 +36,6 @@ _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 0.02, 0.02, 0.02])  # what the factors 
 _CANDIDATES = 60  # places looked at first
 _FINER = 10  # times finer are the places near the best
 _SAME_M, _SAME_RAD = 5e-3, 1e-2  # starts so near to each other lead to the same fit
-_HUBER = 2.0  # sigmas, as in the calibration (solve.py)
-_FLOOR_M = 1e-6  # as in solve.py: below any scanner or arm, keeps exact data from dividing by zero
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,51 +161,30 @@ def _fit(
     ``sigma`` (m, an axis) is estimated from the residuals where it is not given.
     """
     n, terms = len(b), TERMS[order]
-    correction = ScannerCorrection(1.0, (0.0, 0.0), (0.0,) * (terms - 3))
-    basis = correction.terms(c)
-    later = np.zeros(n, dtype=bool) if split is None else np.arange(n) >= split
+    basis = ScannerCorrection.unchanged(terms).terms(c)
     poses = 1 if split is None else 2
-    X = [(start.rotation().matrix(), np.asarray(start.translation()))] * poses
-    factors = np.zeros(terms)
-    given, own = sigma, 1e-3
     free = max(3 * n - 6 * poses - terms, 3)
-    e = np.zeros((n, 3))
-    for _ in range(12):
-        q, J = np.zeros((n, 3)), np.zeros((n, 3, 6 * poses + terms))
-        pivot = b.mean(axis=0)
-        for s, (R, p) in enumerate(X):
-            rows = later == bool(s)
-            seen = c[rows] * (1.0 + basis[rows] @ factors)[:, None]
-            q[rows] = seen @ R.T + p
-            J[rows, :, 6 * s : 6 * s + 3], J[rows, :, 6 * s + 3 : 6 * s + 6] = -skew(q[rows] - pivot), np.eye(3)
-            J[rows, :, 6 * poses :] = (c[rows] @ R.T)[:, :, None] * basis[rows][:, None]
-        e = q - b
-        size = np.linalg.norm(e, axis=1)
-        own = max(
-            float(np.median(size)) / 1.538 * float(np.sqrt(3 * n / free)), _FLOOR_M
-        )  # median of chi, 3 dof: 1.538
-        scale = own if given is None else given
-        w = np.minimum(1.0, _HUBER * np.sqrt(3.0) * scale / np.maximum(size, 1e-12))
-        prior = np.zeros(J.shape[2])
-        prior[6 * poses :] = (scale / _USUAL[:terms]) ** 2
-        JW = (J * w[:, None, None]).reshape(3 * n, -1).T
-        N = JW @ J.reshape(3 * n, -1) + np.diag(prior)
-        g = JW @ e.reshape(-1) + prior * np.concatenate([np.zeros(6 * poses), factors])
-        step = -np.linalg.lstsq(N, g, rcond=1e-13)[0]
-        factors = factors + step[6 * poses :]
-        X = [
-            (
-                exp_rotation(step[6 * s : 6 * s + 3]) @ R,
-                exp_rotation(step[6 * s : 6 * s + 3]) @ (p - pivot) + pivot + step[6 * s + 3 : 6 * s + 6],
-            )
-            for s, (R, p) in enumerate(X)
-        ]
-        if float(np.linalg.norm(step)) < 1e-9:
-            break
-    scale = own if given is None else given
-    size, limit = np.linalg.norm(e, axis=1) / scale, _HUBER * np.sqrt(3.0)
-    loss = float(
-        np.where(size < limit, size**2, 2.0 * limit * size - limit**2).sum() + ((factors / _USUAL[:terms]) ** 2).sum()
+
+    def linearised(at: Unknowns) -> tuple[Observed]:
+        J, q = np.zeros((n, 3, 6 * poses + terms)), np.zeros((n, 3))
+        for i, part in enumerate((slice(0, split), slice(split, n))[:poses]):
+            of = slice(6 * i, 6 * i + 6)
+            q[part], J[part, :, of], J[part, :, 6 * poses :] = scanned(at.poses[i], c[part], basis[part], at.numbers)
+        return (Observed(q - b, J),)
+
+    def spread(left: Remainder) -> float:
+        return by_median(left) * float(np.sqrt(3 * n / free))
+
+    found = adjust(
+        Unknowns((np.asarray(start.GetAsMatrix4()),) * poses, np.zeros(terms)),
+        linearised,
+        (Kind(rank=3, loss=huber, spread=spread if sigma is None else None, sigma=sigma),),
+        prior=np.diag(_USUAL[:terms] ** -2),
+        steps=12,
     )
-    rigid = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p) for R, p in X]
-    return _Split(rigid[0], rigid[-1], loss if given is not None else float(np.log(scale) * 3 * n + loss), scale, own)
+    e, scale = found.rows[0].e, found.sigmas[0]
+    square = (e**2).sum(axis=1) / scale**2
+    loss = float(huber_cost(square, 3).sum() + ((found.at.numbers / _USUAL[:terms]) ** 2).sum())
+    rigid = [as_transform(X) for X in found.at.poses]
+    value = loss if sigma is not None else float(np.log(scale) * 3 * n + loss)
+    return _Split(rigid[0], rigid[-1], value, scale, spread(Remainder(e)))

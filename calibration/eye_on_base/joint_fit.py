@@ -84,7 +84,7 @@ def estimate_jointly(
     good = [o for o, keep in zip(observations, rigid.inliers, strict=True) if keep]
     if not correct_scanner or len(good) < LEAST:
         return rigid, None
-    fit = _fit(good, patterns, rigid.X_BC, config.seed)
+    fit = _fit(good, patterns, rigid.X_BC, config.seed, whole=True)
     corrected = [corrected_observation(fit.correction, o) for o in observations]
     found, applied = fit.found, fit.corrects
     estimate = replace(
@@ -138,13 +138,24 @@ def solve_jointly(
     return fit.X_BC, fit.correction if fit.corrects else ScannerCorrection()
 
 
-def _fit(good: Sequence[Observation], patterns: Mapping[str, HolePattern], X_rigid: RigidTransform, seed: int) -> _Fit:
-    """Estimate pose and correction from poses without outliers (n >= 4), and decide on the correction."""
+def _fit(
+    good: Sequence[Observation],
+    patterns: Mapping[str, HolePattern],
+    X_rigid: RigidTransform,
+    seed: int,
+    *,
+    whole: bool = False,
+) -> _Fit:
+    """Estimate pose and correction from poses without outliers (n >= 4), and decide on the correction.
+
+    ``whole``: say what the motion alone asks for, even where there is nothing to compare it with.
+    """
     motion, holes, contradict = None, None, False  # each alone, only to see whether the two sources contradict
     if len(good) >= _LEAST_TO_COMPARE:
-        motion = from_motion(good, {}, seed=seed, start=X_rigid)
         holes = from_holes(good, patterns)
-        contradict = holes is not None and _differ(motion, holes)
+        if holes is not None or whole:
+            motion = from_motion(good, {}, seed=seed, start=X_rigid)
+        contradict = holes is not None and motion is not None and _differ(motion, holes)
     order = 3 if len(good) >= _LEAST_FOR_THIRD else 2
     confirmed = {} if contradict else patterns
     found = from_motion(good, confirmed, seed=seed, order=order, usual=True, start=X_rigid)

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
+from weldcal.calibration.adjustment import Kind, Observed, Remainder, Unknowns, adjust, scanned, soft_l1
 from weldcal.calibration.data.scanner_correction import (
     LARGEST,
     LOOSE,
@@ -18,10 +19,9 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.robust import MAD, chi2_share, cross_rows, rotation_of
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.robust import MAD, chi2_share
+from weldcal.calibration.geometry.se3 import as_transform, skew
 from weldcal.models.arrays import Array
-from weldcal.models.compiled import compiled
 
 LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
@@ -117,25 +117,54 @@ def from_motion(
     prior = np.zeros(size)
     prior[6 : 6 + terms] = 1.0 / expected_factors(terms, float(np.median(c[:, 2])), usual)
     prior[6 + terms :] = 1.0 / CIRCLE_OWN[: size - 6 - terms]
-    found = _gauss_newton(
-        *(c, b, vague, shape.terms(c)),  # a correction is linear in its factors
-        *(c[has], m, z, shape.terms(c[has]), shape.slopes(c[has])),
-        *(rows, ratio, prior, start.rotation().matrix().copy(), np.array(start.translation())),
-        *(sigma_p, sigma_n, sigma_r),
+    own = size - 6 - terms
+    basis, basis_n, slopes = shape.terms(c), shape.terms(c[has]), shape.slopes(c[has])
+    lean = (c[has] * m).sum(axis=1)
+
+    def linearised(at: Unknowns) -> tuple[Observed, ...]:
+        X, change = at.poses[0], at.numbers[:terms].copy()
+        change[0] = np.clip(change[0], -LARGEST, LARGEST)
+        J = np.zeros((len(b), 3, size))
+        q, J[:, :, :6], J[:, :, 6 : 6 + terms] = scanned(X, c, basis, change)
+        # a normal turns by the inverse transpose of the correction's derivative f 1 + c s' (Sherman-Morrison)
+        s = np.zeros((len(z), 3))
+        s[:, :2] = np.einsum("nti,t->ni", slopes, change)
+        seen = m - s * (lean / (1.0 + basis_n @ change + (c[has] * s).sum(axis=1)))[:, None]
+        seen = (seen / np.linalg.norm(seen, axis=1)[:, None]) @ X[:3, :3].T
+        tilt = np.zeros((len(z), 3, size))
+        tilt[:, :, :3] = -skew(seen)
+        tilt[:, :, 6 : 6 + terms] = X[:3, :2] @ np.swapaxes(-lean[:, None, None] * slopes, 1, 2)
+        across = np.eye(3) - z[:, :, None] * z[:, None, :]
+        circles = np.zeros((len(ratio), 1, size))
+        circles[:, 0, 6 : 6 + terms] = ratio[:, None] * rows
+        circles[:, 0, 6 + terms :] = -rows[:, :own]
+        off = ratio * (rows @ (np.eye(terms)[0] + change)) - 1.0 - rows[:, :own] @ at.numbers[terms:]
+        e_p = (q - b) / vague[:, None]
+        e_n = (across @ (seen - z)[:, :, None])[:, :, 0]
+        return (
+            Observed(e_p.reshape(-1, 1), (J / vague[:, None, None]).reshape(-1, 1, size)),
+            Observed(e_n.reshape(-1, 1), (across @ tilt).reshape(-1, 1, size)),
+            Observed(off[:, None], circles),
+        )
+
+    found = adjust(
+        Unknowns((np.asarray(start.GetAsMatrix4()),), np.zeros(size - 6)),
+        linearised,
+        (
+            Kind(rank=1.0, loss=soft_l1, spread=_bounded, sigma=sigma_p),
+            Kind(rank=2.0 / 3.0, loss=soft_l1, spread=_bounded, sigma=sigma_n),  # two numbers of a normal's three
+            Kind(rank=1.0, loss=soft_l1, sigma=sigma_r),
+        ),
+        prior=np.diag(prior[6:] ** 2),
     )
-    R, p, change, information, redundancy, sigma_p, sigma_n = found
-    pivot = b.mean(axis=0)
-    inverse = np.linalg.inv(information)[: 6 + terms, : 6 + terms]
-    T = np.eye(6 + terms)
-    T[3:6, :3] = -skew(p - pivot)
-    X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-    joint: Array = np.asarray(T @ inverse @ T.T, dtype=np.float64)
+    joint = found.covariance[: 6 + terms, : 6 + terms]
+    change, (sigma_p, sigma_n, _) = found.at.numbers, found.sigmas
     return CorrectionEstimate(
         correction=correction_of(change[:terms], field),
         covariance=joint[6:, 6:],
-        X_BC=X_BC,
+        X_BC=as_transform(found.at.poses[0]),
         joint=joint,
-        redundancy=redundancy,
+        redundancy=found.spare[0],
         sigma_position_m=float(sigma_p),
         sigma_normal_rad=float(sigma_n),
     )
@@ -153,119 +182,11 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
     return CorrectionEstimate(correction=correction_of(v), covariance=np.asarray(inverse))
 
 
-@compiled()
-def _gauss_newton(
-    c: Array,
-    b: Array,
-    vague: Array,
-    basis: Array,
-    c_n: Array,
-    m: Array,
-    z: Array,
-    basis_n: Array,
-    slopes: Array,
-    rows: Array,
-    ratio: Array,
-    prior: Array,
-    R: Array,
-    p: Array,
-    sigma_p: float,
-    sigma_n: float,
-    sigma_r: float,
-) -> tuple[Array, Array, Array, Array, float, float, float]:
-    """Return the loop of from_motion.
-
-    Pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
-
-    Centres c, b (n, 3) with ``vague`` (n,) and the correction's terms (n, K); of those with a normal m (h, 3), z (h, 3)
-    in the base, their centres, terms and ``slopes`` (h, K, 2); of k hole circles rows (k, K) and ratio (k,). ``prior``
-    (6 + K or 9 + K,) are inverse sigmas. A normal turns by the inverse transpose of the correction's derivative f 1 + c
-    s'; its linear part at the identity is what a small change of a factor does.
-    """
-    n, h, k, terms, size = len(b), len(z), len(ratio), basis.shape[1], len(prior)
-    own = size - 6 - terms
-    pivot = np.array([b[:, 0].mean(), b[:, 1].mean(), b[:, 2].mean()])
-    change = np.zeros(size - 6)
-    redundancy = 1.0
-    information = np.eye(size)
-    J = np.zeros((3 * n + 3 * h + k, size))
-    e = np.zeros(len(J))
-    e_p, e_n, tilt, turn = np.zeros(3 * n), np.zeros(3 * h), np.zeros((3, size)), np.zeros(3)
-    s, seen = np.zeros(3), np.zeros(3)
-    for count in range(40):
-        values = change[:terms].copy()
-        values[0] = 1.0 + min(max(change[0], -LARGEST), LARGEST)
-        for i in range(n):
-            factor = basis[i] @ values
-            q = R @ (factor * c[i]) + p
-            a = q - pivot
-            along = R @ c[i]
-            weight = 1.0 / (vague[i] * sigma_p)
-            for x in range(3):
-                row = 3 * i + x
-                e_p[row] = (q[x] - b[i, x]) / vague[i]
-                e[row] = e_p[row] / sigma_p
-                J[row, 3 + x] = weight
-                for t in range(terms):
-                    J[row, 6 + t] = along[x] * basis[i, t] * weight
-            cross_rows(J[3 * i : 3 * i + 3], a, weight)
-        for i in range(h):
-            factor = basis_n[i] @ values
-            s[:] = 0.0
-            for t in range(terms):
-                s[0] += slopes[i, t, 0] * values[t]
-                s[1] += slopes[i, t, 1] * values[t]
-            lean = c_n[i] @ m[i]
-            seen[:] = m[i] - s * (lean / (factor + c_n[i] @ s))  # Sherman-Morrison; its length does not count
-            seen[:] = R @ (seen / np.sqrt(seen @ seen))
-            cross_rows(tilt, seen, 1.0)
-            for t in range(terms):
-                turn[0], turn[1] = -lean * slopes[i, t, 0], -lean * slopes[i, t, 1]
-                tilt[:, 6 + t] = R @ turn
-            off = seen - z[i]
-            off -= (off @ z[i]) * z[i]
-            for x in range(3):
-                e_n[3 * i + x] = off[x]
-                e[3 * (n + i) + x] = off[x] / sigma_n
-            for y in range(6 + terms):
-                lengthwise = z[i] @ np.ascontiguousarray(tilt[:, y])
-                for x in range(3):
-                    J[3 * (n + i) + x, y] = (tilt[x, y] - lengthwise * z[i, x]) / sigma_n
-        for i in range(k):
-            row = 3 * (n + h) + i
-            off_size = ratio[i] * (rows[i] @ values) - 1.0
-            for t in range(terms):
-                J[row, 6 + t] = ratio[i] * rows[i, t] / sigma_r
-            for t in range(own):
-                J[row, 6 + terms + t] = -rows[i, t] / sigma_r
-                off_size -= rows[i, t] * change[terms + t]
-            e[row] = off_size / sigma_r
-        w = 1.0 / np.sqrt(1.0 + (e / 2.0) ** 2)
-        weighted = J * w.reshape(-1, 1)
-        information = J.T @ weighted + np.diag(prior**2)
-        gradient = weighted.T @ e
-        gradient[6:] += prior[6:] ** 2 * change
-        step = -np.linalg.solve(information, gradient)
-        dR = rotation_of(step[:3])
-        R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
-        change = change + step[6:]
-        if count in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy
-            taken = ((J @ np.linalg.inv(information)) * weighted).sum(axis=1)
-            redundancy = max(3.0 * n - taken[: 3 * n].sum(), 1.0)
-            sigma_p = max(_spread(e_p, 3 * n) * np.sqrt(3 * n / redundancy), 1e-6)
-            if h:
-                left = max(2.0 * h - taken[3 * n : 3 * (n + h)].sum(), 1.0)
-                sigma_n = max(_spread(e_n, 2 * h) * np.sqrt(2 * h / left), 1e-6)
-        if count > 9 and np.sqrt(step @ step) < 1e-9:
-            break
-    return R, p, change, information, redundancy, sigma_p, sigma_n
-
-
-@compiled()
-def _spread(e: Array, count: int) -> float:
-    """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
-    limit = 4.0 * MAD * np.median(np.abs(e))
-    return np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count)  # type: ignore[no-any-return]
+def _bounded(left: Remainder) -> float:
+    """By residuals (n, 1), half of it from their middle: a few wild ones do not set it."""
+    e = np.abs(left.e)
+    square = np.minimum(e, 4.0 * MAD * np.median(e)) ** 2
+    return float(np.sqrt(square.sum() / left.spare))
 
 
 def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 
 import numpy as np
@@ -11,14 +11,21 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.special import gammaincinv
 
+from weldcal.calibration.adjustment import Kind, Observed, Spread, Unknowns, adjust, helmert, huber
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.robust import chi2_quantile, cross_rows, f_quantile, rotation_of
-from weldcal.calibration.geometry.se3 import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation, skew
+from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile
+from weldcal.calibration.geometry.se3 import (
+    as_transform,
+    drawn_triples,
+    fit_all_rigid_sets,
+    fit_rigid_sets,
+    fit_rotation,
+    skew,
+)
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 from weldcal.models.arrays import Array
-from weldcal.models.compiled import compiled
 
 __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
 
@@ -26,13 +33,11 @@ Flags = NDArray[np.bool_]
 
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
-_HUBER = 2.0  # sigmas per axis, a choice: 99 % of least squares' information on a normal axis; 1.0 keeps 90 %
 _START_POSES = 500  # at most: more do not make a start better
 _HELD_OUT_FITS = 100  # at most, so that the time grows with the number of poses and not with its square
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _WORST_TILT_RAD = 0.17  # of the normals' median: no arm, scanner or fit is ten degrees off
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
-_NORMAL_FLOOR_RAD = 1e-6  # below any scanner or arm, as _POSITION_FLOOR_M
 USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 """What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 
@@ -75,8 +80,7 @@ class _Data:
 @dataclass(frozen=True, kw_only=True)
 class _Solution:
     X_BC: RigidTransform
-    information: Array  # about the pivot
-    pivot: Array
+    information: Array
     var_p: float
     var_n: float
     information_p: Array  # what the positions alone bring of it
@@ -140,7 +144,7 @@ def estimate_eye_on_base(
     sigma_p = float(np.sqrt(solution.var_p))
     return CalibrationEstimate(
         X_BC=solution.X_BC,
-        covariance=_covariance_at_camera(solution),
+        covariance=_widened(solution),
         inliers=inliers,
         position_residuals_m=residual,
         tilt_residuals_rad=tilt,
@@ -178,6 +182,13 @@ def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
     sine = np.sqrt(cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)  # np.cross and norm take four times as long
     tilt = np.arctan2(sine, (seen * z).sum(axis=1))
     return _distances(data, X_BC), np.where(data.has, tilt, np.nan)
+
+
+def robust_start(b: Array, c: Array, config: SolveConfig) -> RigidTransform:
+    """Return the camera pose that explains most of n centres: b (n, 3) in the base, c (n, 3) in the camera, m."""
+    n, none = len(b), np.zeros((len(b), 3))
+    unknown = _Data(b=b, c=c, z=none, m=none, has=np.zeros(n, bool), cov=np.zeros((n, 3, 3)), var_n=np.zeros(n))
+    return _robust_start(unknown, config)
 
 
 def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
@@ -256,14 +267,7 @@ def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple
     dof = max(3 * h - 6, 1) / (3 * h)
     sigma = max(_scale_from_trimmed(e, h) / np.sqrt(dof), _POSITION_FLOOR_M) * _loose(3 * h - 6)
     keep = _gate(data, start, sigma**2) if n > 4 else np.ones(n, dtype=bool)
-    solution = _Solution(
-        X_BC=start,
-        information=np.eye(6),
-        pivot=data.b.mean(axis=0),
-        var_p=sigma**2,
-        var_n=1e-3**2,
-        information_p=np.eye(6),
-    )
+    solution = _Solution(X_BC=start, information=np.eye(6), var_p=sigma**2, var_n=1e-3**2, information_p=np.eye(6))
     seen: set[bytes] = set()
     for _ in range(12):
         solution = _fit(data, keep, solution, usual)
@@ -296,101 +300,42 @@ def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
 
 
 def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0) -> _Solution:
-    """Solve by weighted Gauss-Newton on the inliers, with variance components updated between steps."""
+    """Adjust the pose to the inliers, with a spread of positions and one of normals."""
     d = data.pick(keep)
-    rows = d.has
-    R, p, N, N_p, redundancy_p, redundancy_n, var_p, var_n = _gauss_newton(
-        *(d.b, d.c, d.cov, d.m[rows], d.z[rows], d.var_n[rows]),
-        *(start.X_BC.rotation().matrix().copy(), np.array(start.X_BC.translation()), start.var_p, start.var_n, usual),
+    c, b, m, z = d.c, d.b, d.m[d.has], d.z[d.has]
+
+    def linearised(at: Unknowns) -> tuple[Observed, Observed]:
+        R, p = at.poses[0][:3, :3], at.poses[0][:3, 3]
+        q, seen = c @ R.T, m @ R.T
+        J, tilt = np.zeros((len(c), 3, 6)), np.zeros((len(m), 3, 6))
+        J[:, :, :3], J[:, :, 3:], tilt[:, :, :3] = -skew(q), np.eye(3), -skew(seen)
+        e = seen - z
+        e -= (e * z).sum(axis=1)[:, None] * z
+        return Observed(q + p - b, J, R @ d.cov @ R.T), Observed(e, tilt, d.var_n[d.has])
+
+    def spread(expected: float) -> Spread:
+        """Helmert's, with ``usual`` residuals of the expected size."""
+        return lambda left: helmert(
+            replace(left, weighted=left.weighted + usual * (expected / left.sigma) ** 2, spare=left.spare + usual)
+        )
+
+    found = adjust(
+        Unknowns((np.asarray(start.X_BC.GetAsMatrix4()),), np.zeros(0)),
+        linearised,
+        (
+            Kind(rank=3, loss=huber, spread=spread(USUAL_SPREAD_M), sigma=float(np.sqrt(start.var_p))),
+            Kind(rank=2, loss=huber, spread=spread(USUAL_TILT_RAD), sigma=float(np.sqrt(start.var_n))),
+        ),
     )
-    X_BC = RigidTransform(RotationMatrix(R), p)
-    pivot = d.b.mean(axis=0)
     return _Solution(
-        X_BC=X_BC,
-        information=N,
-        pivot=pivot,
-        var_p=var_p,
-        var_n=var_n,
-        information_p=N_p,
-        redundancy=redundancy_p + usual,
-        redundancy_n=redundancy_n + usual,
+        X_BC=as_transform(found.at.poses[0]),
+        information=found.information,
+        information_p=found.of[0],
+        var_p=found.sigmas[0] ** 2,
+        var_n=found.sigmas[1] ** 2,
+        redundancy=found.spare[0] + usual,
+        redundancy_n=found.spare[1] + usual,
     )
-
-
-@compiled()
-def _gauss_newton(
-    b: Array,
-    c: Array,
-    cov: Array,
-    m: Array,
-    z: Array,
-    own_n: Array,
-    R: Array,
-    p: Array,
-    var_p: float,
-    var_n: float,
-    usual: float,
-) -> tuple[Array, Array, Array, Array, float, float, float, float]:
-    """Return the loop of _fit.
-
-    Pose, information of all and of the positions, redundancies and variance components of both kinds.
-
-    Places b and centres c (n, 3) with the fits' covariances (n, 3, 3); normals m seen and z stated (h, 3) with their
-    variances (h,).
-    """
-    n, h = len(b), len(z)
-    pivot = np.array([b[:, 0].mean(), b[:, 1].mean(), b[:, 2].mean()])
-    N, N_p, redundancy_p, redundancy_n = np.eye(6), np.eye(6), 1.0, 1.0
-    J = np.zeros((3, 6))
-    for count in range(40):
-        N_p, N_n, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
-        square_p, square_n = 0.0, 0.0
-        for i in range(n):
-            q = R @ c[i] + p
-            e = q - b[i]
-            a = q - pivot
-            J[:] = 0.0
-            cross_rows(J, a, 1.0)
-            J[0, 3], J[1, 4], J[2, 5] = 1.0, 1.0, 1.0
-            W = np.linalg.inv(R @ np.ascontiguousarray(cov[i]) @ R.T + var_p * np.eye(3))
-            chi = max(e @ W @ e / 3.0, 1e-30)
-            w = min(1.0, _HUBER / np.sqrt(chi))
-            square_p += 3.0 * w * chi
-            weighted = w * (J.T @ W)
-            N_p += weighted @ J
-            g += weighted @ e
-        for i in range(h):
-            seen = R @ m[i]
-            e = seen - z[i]
-            e -= (e @ z[i]) * z[i]
-            J[:] = 0.0
-            cross_rows(J, seen, 1.0)
-            known = 1.0 / (own_n[i] + var_n)
-            chi = max((e @ e) * known / 2.0, 1e-30)
-            w = min(1.0, _HUBER / np.sqrt(chi))
-            square_n += 2.0 * w * chi
-            N_n += (w * known) * (J.T @ J)
-            g += (w * known) * (J.T @ e)
-        N = N_p + N_n
-        step = -np.linalg.lstsq(N, g, 1e-12)[0]
-        dR = rotation_of(step[:3])
-        p = dR @ (p - pivot) + pivot + step[3:]
-        U, _, Vt = np.linalg.svd(dR @ R)  # rounding must not add up
-        R = U @ Vt
-        # Helmert's simplified estimator: each group's weighted square sum over its own redundancy
-        inverse = np.linalg.pinv(N)
-        redundancy_p = max(3.0 * n - np.trace(inverse @ N_p), 0.3)
-        redundancy_n = max(2.0 * h - np.trace(inverse @ N_n), 0.3)
-        ratio_p = (square_p + usual * USUAL_SPREAD_M**2 / var_p) / (redundancy_p + usual)
-        ratio_n = (square_n + usual * USUAL_TILT_RAD**2 / var_n) / (redundancy_n + usual)
-        # Damped: a component grows where residuals exceed their prediction, and falls to a floor.
-        new_p = max(var_p * min(max(ratio_p, 0.1), 100.0), _POSITION_FLOOR_M**2)
-        new_n = max(var_n * min(max(ratio_n, 0.1), 100.0), _NORMAL_FLOOR_RAD**2) if h else var_n
-        settled = abs(new_p / var_p - 1.0) + abs(new_n / var_n - 1.0) < 1e-4
-        var_p, var_n = new_p, new_n
-        if count > 2 and settled and np.sqrt(step @ step) < 1e-10:
-            break
-    return R, p, N, N_p, redundancy_p, redundancy_n, var_p, var_n
 
 
 def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut, usual: float) -> HeldOut:
@@ -406,16 +351,8 @@ def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldO
     return HeldOut(position, tilt)
 
 
-def _covariance_at_camera(solution: _Solution) -> Array:
-    """Move the tangent from the pivot to the camera origin, and widen it for spreads that were themselves estimated."""
-    T = np.eye(6)
-    T[3:, :3] = -skew(np.asarray(solution.X_BC.translation()) - solution.pivot)
-    out = T @ _widened(solution) @ T.T
-    return np.asarray(0.5 * (out + out.T))
-
-
 def _widened(solution: _Solution) -> Array:
-    """Widen the covariance about the pivot for few poses.
+    """Widen the covariance for few poses and for spreads that were themselves estimated.
 
     Its Gaussian 95 % region then holds the truth in 95 of 100 calibrations.
 

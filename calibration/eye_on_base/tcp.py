@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, by_median, plain, scanned, soft_l1
+from weldcal.calibration.eye_on_base.solve import SolveConfig, robust_start
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, fit_with_offset, skew
+from weldcal.calibration.geometry.se3 import as_transform, fit_with_offset
 from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
@@ -104,7 +106,8 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
     if n < 5 or 3 * n - 9 - terms < _LEAST_FREE:
         return None
     data = _Data.of(observations, order)
-    starts = [one for one in (start, _linear_start(data), _rigid_start(data)) if one is not None]
+    rigid = robust_start(data.b, data.c, SolveConfig(hypotheses=300))
+    starts = [one for one in (start, _linear_start(data), rigid) if one is not None]
     fitted = [_fit(data, one, offset=True) for one in starts]
     best = min(fitted, key=lambda one: float(np.median(one.norms)))
     scale = float(np.median(best.norms)) / 1.5382  # of the chi distribution with three free
@@ -179,43 +182,28 @@ class _Fit:
 def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = True) -> _Fit:
     """Gauss-Newton over pose, scanner terms and, where asked, the offset; reweighted (soft L1) where ``robust``."""
     n, K = data.terms.shape
-    R, p = start.rotation().matrix(), np.asarray(start.translation())
-    scanner, b = np.zeros(K), np.zeros(3)
     size = 6 + K + (3 if offset else 0)
-    J, norms, unit = np.zeros((n, 3, size)), np.zeros(n), np.ones(size)
-    for k in range(40):
-        q = (data.c * (1.0 + data.terms @ scanner)[:, None]) @ R.T
-        e = (q + p - data.b - data.R @ b) * data.weight[:, None]
-        J[:, :, :3], J[:, :, 3:6] = -skew(q), np.eye(3)
-        J[:, :, 6 : 6 + K] = (data.c @ R.T)[:, :, None] * data.terms[:, None]
+
+    def linearised(at: Unknowns) -> tuple[Observed]:
+        J, b = np.zeros((n, 3, size)), np.zeros(3)
+        q, J[:, :, :6], J[:, :, 6 : 6 + K] = scanned(at.poses[0], data.c, data.terms, at.numbers[:K])
         if offset:
-            J[:, :, 6 + K :] = -data.R
-        rows = J * data.weight[:, None, None]
-        norms = np.linalg.norm(e, axis=1)
-        w = np.ones(n)
-        if robust:
-            scale = max(float(np.median(norms)) / 1.5382, 1e-9)
-            w = (1.0 + (norms / (2.0 * scale)) ** 2) ** -0.25
-        A = (rows * w[:, None, None]).reshape(-1, size)
-        unit = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
-        step = -np.linalg.lstsq(A / unit, (e * w[:, None]).ravel(), rcond=_SINGULAR)[0] / unit
-        dR = exp_rotation(step[:3])
-        R, p, scanner = (
-            RotationMatrix.ProjectToRotationMatrix(dR @ R).matrix(),
-            p + step[3:6],
-            scanner + step[6 : 6 + K],
-        )
-        b = b + step[6 + K :] if offset else b
-        if k > 3 and float(np.linalg.norm(step[:6])) < 1e-10:
-            break
-    _, s, Vt = np.linalg.svd((J * data.weight[:, None, None]).reshape(-1, size) / unit, full_matrices=False)
+            J[:, :, 6 + K :], b = -data.R, at.numbers[K:]
+        return (Observed((q - data.b - data.R @ b) * data.weight[:, None], J * data.weight[:, None, None]),)
+
+    kind = Kind(rank=3, loss=soft_l1 if robust else plain, spread=by_median if robust else None)
+    found = adjust(Unknowns((np.asarray(start.GetAsMatrix4()),), np.zeros(size - 6)), linearised, (kind,))
+    e, J = found.rows[0].e, found.rows[0].J.reshape(-1, size)
+    unit = np.maximum(np.linalg.norm(J, axis=0), 1e-12)  # no division by zero
+    _, s, Vt = np.linalg.svd(J / unit, full_matrices=False)
     shown = s > _SINGULAR * s[0]
     factor = np.full(3, np.inf)
     if offset:
         hidden = (Vt[~shown, 6 + K :] ** 2).sum(axis=0) > _SINGULAR
         spread = np.sqrt(((Vt[shown, 6 + K :] / s[shown, None]) ** 2).sum(axis=0)) / unit[6 + K :]
         factor = np.where(hidden, np.inf, spread)
-    return _Fit(RigidTransform(RotationMatrix(R), p), b, factor, norms, int(shown.sum()))
+    X_BC, b = found.at.poses[0], found.at.numbers[K:] if offset else np.zeros(3)
+    return _Fit(as_transform(X_BC), b, factor, np.linalg.norm(e, axis=1), int(shown.sum()))
 
 
 def _linear_start(data: _Data) -> RigidTransform | None:
@@ -227,10 +215,3 @@ def _linear_start(data: _Data) -> RigidTransform | None:
         return None
     R, p, _ = fit_with_offset(data.b, data.c, data.R)
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-
-
-def _rigid_start(data: _Data) -> RigidTransform | None:
-    try:
-        return fit_rigid(data.b, data.c)
-    except ValueError:
-        return None

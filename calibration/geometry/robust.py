@@ -1,4 +1,4 @@
-"""Robust statistics, what compiled loops need besides (a median, a small Cholesky solution, rotations), and the order.
+"""Robust statistics, what compiled loops need besides (a median, a small Cholesky solution), and the order.
 
 The order of rows says which of two lists of poses belong together. What is the same on both sides of every pair of rows
 (the angle of the motion between them, or the distance of two points) gives orders by an assignment. A solution with
@@ -8,7 +8,6 @@ each order selects one and shows the rows that have no partner.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,30 +134,6 @@ def radius_95(S: Array) -> float:
     mean, square = float(np.trace(S)), float(np.trace(S @ S))
     freedom = mean**2 / square if square > 0.0 else 3.0
     return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
-
-
-@compiled()
-def cross_rows(J: Array, v: NDArray[np.floating[Any]], weight: float) -> None:
-    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns.
-
-    The diagonal stays.
-    """
-    J[0, 1], J[0, 2], J[1, 2] = weight * v[2], -weight * v[1], weight * v[0]
-    J[1, 0], J[2, 0], J[2, 1] = -weight * v[2], weight * v[1], -weight * v[0]
-
-
-@compiled()
-def rotation_of(w: NDArray[np.floating[Any]]) -> Array:
-    """Rotation (3, 3) of a rotation vector (3,) rad (Rodrigues)."""
-    angle = np.sqrt(w @ w)
-    S = np.zeros((3, 3))
-    cross_rows(S, w, -1.0)
-    if angle < 1e-4:
-        first, second = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
-    else:
-        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
-    R: Array = np.eye(3) + first * S + second * (S @ S)
-    return R
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, plain
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import IDENTITY, flange_poses, inverse, log_rotation, mean_pose
 from weldcal.calibration.hand_eye.mountings import chain as mounted
@@ -38,7 +39,6 @@ from weldcal.models.errors import InputError, WeldcalError
 KINDS = ("joints", "links")
 _STEP = 1e-3  # of the prior's standard deviation, for the differences by the robot's errors
 _STEPS = 25
-_SETTLED = 1e-7  # of a sigma, and of a variance: a choice far below what is printed; it costs a step or two
 _SAME_M, _SAME_RAD = 5e-3, float(np.radians(0.5))  # a factory calibration moves the flange by no more
 _CHANCE = 2.6  # standard errors by which held-out errors must fall: 1 in 200 by chance
 _COLUMN_LOSS = 0.01  # how much worse one column may get while the other gets better
@@ -273,36 +273,29 @@ def _state_of(result: HandEyeResult) -> State:
 
 
 def _fit(robot: _Robot, state: State, k: int, centre: Array) -> _Found:
-    """Gauss-Newton on poses and robot errors together, the two noises by Helmert's estimator as in fit.fit."""
-    u = np.zeros(len(robot.which))
-    noise = np.ones(2)
-    n = float(len(robot.q))
-    floor = robot.problem(u).extent ** 2 * TINY
-    for step in range(_STEPS):
-        problem = robot.problem(u)
-        lin = linearise(problem, state, centre)
-        Jw, Jd = _by_errors(robot, state, k, centre, u)
-        Jw, Jd = (np.concatenate([a, b], axis=2).reshape(-1, 12 + k) for a, b in ((lin.Jw, Jw), (lin.Jd, Jd)))
-        w, d = lin.w.reshape(-1), lin.d.reshape(-1)
-        if step == 0:
-            noise = np.array([max(float(w @ w) / w.size, TINY), max(float(d @ d) / d.size, floor)])
-        prior = np.diag(np.append(np.zeros(12), np.ones(k)))
-        A = Jw.T @ Jw / noise[0] + Jd.T @ Jd / noise[1] + prior
-        V = inverse_information(A)
-        g = Jw.T @ w / noise[0] + Jd.T @ d / noise[1] + prior @ np.append(np.zeros(12), u[:k])
-        change = -V @ g
-        state = problem.step(state, change[:12])
-        u = u + np.append(change[12:], np.zeros(len(u) - k))
-        w, d = residuals(robot.problem(u), state, centre)
-        free = [3.0 * n - float((V * (J.T @ J)).sum()) / s for J, s in ((Jw, noise[0]), (Jd, noise[1]))]
-        new = np.maximum([(w**2).sum() / max(free[0], 1.0), (d**2).sum() / max(free[1], 1.0)], [TINY, floor])
-        done = float(np.sqrt(max(float(change @ A @ change), 0.0))) < _SETTLED
-        done = done and bool(np.abs(new / noise - 1.0).max() < _SETTLED)
-        noise = new
-        if done:
-            break
+    """Adjust poses and the first ``k`` robot errors together, with a noise of rotations and one of positions."""
+    rest = np.zeros(len(robot.which) - k)
+    floor = robot.problem(np.append(np.zeros(k), rest)).extent * np.sqrt(TINY)
+
+    def linearised(at: Unknowns) -> tuple[Observed, Observed]:
+        now, u = (at.poses[0], at.poses[1], state[2]), np.append(at.numbers, rest)
+        lin = linearise(robot.problem(u), now, centre)
+        Jw, Jd = _by_errors(robot, now, k, centre, u)
+        return Observed(lin.w, np.concatenate([lin.Jw, Jw], axis=2)), Observed(
+            lin.d, np.concatenate([lin.Jd, Jd], axis=2)
+        )
+
+    start = Unknowns(state[:2], np.zeros(k))
+    sizes = [float(np.sqrt((rows.e**2).mean())) for rows in linearised(start)]
+    kinds = [
+        Kind(rank=3, loss=plain, spread=helmert, sigma=max(size, least), floor=least)
+        for size, least in zip(sizes, (float(np.sqrt(TINY)), floor), strict=True)
+    ]
+    found = adjust(start, linearised, kinds, prior=np.eye(k), steps=_STEPS)
+    A, (X, Y) = found.information, found.at.poses
     slope = -inverse_information(A[:12, :12]) @ A[:12, 12:]
-    return _Found(state, u, V, slope, (float(noise[0]), float(noise[1])))
+    w, d = (sigma**2 for sigma in found.sigmas)
+    return _Found((X, Y, state[2]), np.append(found.at.numbers, rest), found.covariance, slope, (w, d))
 
 
 def _by_errors(robot: _Robot, state: State, k: int, centre: Array, u: Array) -> tuple[Array, Array]:

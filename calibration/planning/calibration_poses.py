@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.adjustment import most_informative
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.clearance import (
@@ -253,34 +254,27 @@ def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: Plann
     # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1
     # mm
     total = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
-    gains = [_information(c.X_BR, X_BC, work, config) for c in pool]
-    places: list[Array] = []
-    chosen: list[PlannedPose] = []
-    free = set(range(len(pool)))
-    while len(chosen) < n and free:
-        now = _value(total)
-        best, best_value = -1, -np.inf
-        for k in sorted(free):
-            p = pool[k].X_BR.translation()
-            if any(float(np.linalg.norm(p - o)) < config.min_spacing_m for o in places):
-                continue
-            value = _value(total + gains[k])
-            if value > best_value:
-                best, best_value = k, value
-        if best < 0:
-            break
-        free.remove(best)
-        total = total + gains[best]
-        places.append(np.asarray(pool[best].X_BR.translation()))
-        c = pool[best]
-        chosen.append(PlannedPose(c.X_BF, c.q, c.X_BR, best_value - now, _sigma_at_work(total)))
-    return chosen
+    gains = np.array([_information(c.X_BR, X_BC, work, config) for c in pool])
+    places = np.array([c.X_BR.translation() for c in pool])
+
+    def apart(chosen: list[int]) -> Array:
+        return np.asarray(
+            (np.linalg.norm(places[:, None] - places[chosen], axis=2) >= config.min_spacing_m).all(axis=1)
+        )
+
+    order, values = most_informative(total, gains, n, _value, apart)
+    before = [float(_value(total)), *values]
+    sums = total + np.cumsum(gains[order], axis=0)
+    return [
+        PlannedPose(c.X_BF, c.q, c.X_BR, values[k] - before[k], _sigma_at_work(sums[k]))
+        for k, c in enumerate(pool[i] for i in order)
+    ]
 
 
-def _value(information: Array) -> float:
-    """Log determinant of the information of X_BC with the bias marginalised out."""
-    A, B, D = information[:6, :6], information[:6, 6:], information[6:, 6:]
-    return float(np.linalg.slogdet(A - B @ np.linalg.solve(D, B.T))[1])
+def _value(information: Array) -> Array:
+    """Log determinants (...) of informations (..., 9, 9) of X_BC with the bias marginalised out."""
+    A, B, D = information[..., :6, :6], information[..., :6, 6:], information[..., 6:, 6:]
+    return np.asarray(np.linalg.slogdet(A - B @ np.linalg.solve(D, np.swapaxes(B, -1, -2)))[1])
 
 
 def _explain(why: Counter[str], found: int, wanted: int) -> str:

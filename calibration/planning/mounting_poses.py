@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.adjustment import most_informative
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.hand_eye.problem import linearise
 from weldcal.calibration.planning.calibration_poses import random_view
@@ -240,13 +241,4 @@ def _greedy(scene: MountingScene, pool: Sequence[MountingPose], plan: MountingPl
     if not pool:
         return []
     gains = information(scene, pool, plan.sigma_position_m, plan.sigma_normal_rad)
-    total = prior(scene)
-    order: list[int] = []
-    left = list(range(len(pool)))
-    while left:
-        values = np.linalg.slogdet(total + gains[left])[1]
-        best = left[int(np.argmax(values))]
-        order.append(best)
-        left.remove(best)
-        total = total + gains[best]
-    return order
+    return most_informative(prior(scene), gains, len(pool), lambda total: np.linalg.slogdet(total)[1])[0]

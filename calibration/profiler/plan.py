@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.adjustment import most_informative
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
@@ -146,23 +147,16 @@ def _greedy(known: Floats, gains: Floats, names: NDArray[np.intp], maps: Floats,
             f"Of the candidate poses {len(names)} see the object in the field, fewer than the {count} asked for: give"
             " more."
         )
-    H, left, chosen = known, list(range(len(names))), []
     unit = np.sqrt(np.diag(known + gains.sum(axis=0)))
-    rms = [_rms(H, maps, unit)]
-    for _ in range(count):
-        values = [_rms(H + gains[k], maps, unit) for k in left]
-        best = int(np.argmin(values))
-        k = left.pop(best)
-        H = H + gains[k]
-        chosen.append(int(names[k]))
-        rms.append(values[best])
-    return PosePlan(tuple(chosen), np.array(rms))
+    chosen, values = most_informative(known, gains, count, lambda H: -_rms(H, maps, unit))
+    return PosePlan(tuple(names[chosen].tolist()), np.array([float(_rms(known, maps, unit)), *np.negative(values)]))
 
 
-def _rms(H: Floats, maps: Floats, unit: Floats) -> float:
+def _rms(H: Floats, maps: Floats, unit: Floats) -> Floats:
+    """Root mean trace (...) of the mapped covariances of informations (..., m, m)."""
     scaled = H / np.outer(unit, unit)
-    covariance = np.linalg.inv(scaled + FLOOR * np.eye(len(H))) / np.outer(unit, unit)
-    return float(np.sqrt(np.mean(np.einsum("fij,jk,fik->f", maps, covariance, maps))))
+    covariance = np.linalg.inv(scaled + FLOOR * np.eye(len(unit))) / np.outer(unit, unit)
+    return np.asarray(np.sqrt(np.einsum("fij,...jk,fik->...", maps, covariance, maps) / len(maps)))
 
 
 def sample_edge_poses(

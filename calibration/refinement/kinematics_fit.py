@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.linalg import block_diag
 
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, plain
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
@@ -17,13 +19,11 @@ from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
 
 KINDS = ("joints", "links")
-_ITERATIONS = 5
 _STEP = 1e-3  # of the prior, for differences
 _USUAL_SCANNER = np.array([2e-3, 1.5e-2, 1.5e-2])  # as in the correction from few poses
 _BEND_PRIOR = 0.05  # 1/m^2 and 1/m^3: a tenth of a per cent at the edge of the field
 _FACE_M = 0.03  # a face is seen that far around its centre
 _LEAST_ORDER = 2  # the arm's errors must not stand in for bends that a plain calibration does without
-_FLOOR_M, _FLOOR_RAD = 1e-6, 1e-6
 _PARTS = ("turn x", "turn y", "offset", "shift x", "shift y", "shift z")
 
 _POSITION_M, _NORMAL_RAD = 1e-4, 1e-3  # what arms and scanners leave of a scan
@@ -206,10 +206,8 @@ def fit_kinematics(
     start[: len(correction.values)] = correction.values - np.eye(len(correction.values))[0]
     correction = correction_of(start, correction.field_m or _field(data))
     mean, information = _scanner_prior(terms, holes, fixed_scanner, start)
-    prior = np.zeros((6 + terms + k,) * 2)
-    prior[6 : 6 + terms, 6 : 6 + terms] = information
-    prior[6 + terms :, 6 + terms :] = np.eye(k)
-    found = KinematicsFit(
+    prior = block_diag(information, np.eye(k))
+    first = KinematicsFit(
         X_BC=X_BC,
         correction=correction,
         u=np.zeros(k),
@@ -219,33 +217,36 @@ def fit_kinematics(
         redundancy=1.0,
         errors=errors,
     )
-    n, seen = len(data.c), int(data.has.sum())
-    A = np.eye(6 + terms + k)
-    for _ in range(_ITERATIONS):
-        J, e = _jacobian(found, data, q), _residuals(found, data, errors.moved(q, data.after, found.u))
-        vague = np.sqrt(1.0 + np.trace(data.own, axis1=1, axis2=2) / 3.0 / found.sigma_position_m**2)
-        w = np.concatenate(
-            [np.repeat(1.0 / (found.sigma_position_m * vague), 3), np.full(3 * n, 1.0 / found.sigma_normal_rad)]
-        )
-        Jw, ew = J * w[:, None], e * w
-        A = Jw.T @ Jw + prior
-        away = np.concatenate([np.zeros(6), found.correction.values - np.eye(terms)[0] - mean, found.u])
-        V = np.linalg.inv(A)
-        step = -V @ (Jw.T @ ew + prior @ away)
-        found = _moved(found, step)
-        left = ew + Jw @ step
-        taken = np.einsum("ij,jk,ik->i", Jw, V, Jw)
-        free_p = max(3.0 * n - float(taken[: 3 * n].sum()), 1.0)
-        free_n = max(2.0 * seen - float(taken[3 * n :].sum()), 1.0)
-        grow_p = float(np.sqrt((left[: 3 * n] ** 2).sum() / free_p))
-        grow_n = float(np.sqrt((left[3 * n :] ** 2).sum() / free_n)) if seen else 1.0
-        found = replace(
-            found,
-            covariance=V,
-            redundancy=free_p,
-            sigma_position_m=max(found.sigma_position_m * grow_p, _FLOOR_M),
-            sigma_normal_rad=max(found.sigma_normal_rad * grow_n, _FLOOR_RAD),
-        )
+    n = len(data.c)
+    own = np.trace(data.own, axis1=1, axis2=2) / 3.0
+
+    def at_(at: Unknowns) -> KinematicsFit:
+        change = correction_of(at.numbers[:terms], correction.field_m)
+        return replace(first, X_BC=as_transform(at.poses[0]), correction=change, u=at.numbers[terms:])
+
+    def linearised(at: Unknowns) -> tuple[Observed, Observed]:
+        f = at_(at)
+        J, e = _jacobian(f, data, q), _residuals(f, data, errors.moved(q, data.after, f.u))
+        (e_p, e_n), (J_p, J_n) = e.reshape(2, n, 3), J.reshape(2, n, 3, -1)
+        return Observed(e_p, J_p, own), Observed(e_n[data.has], J_n[data.has])
+
+    end = adjust(
+        Unknowns((np.asarray(X_BC.GetAsMatrix4()),), np.concatenate([start, np.zeros(k)])),
+        linearised,
+        (
+            Kind(rank=3, loss=plain, spread=helmert, sigma=first.sigma_position_m),
+            Kind(rank=2, loss=plain, spread=helmert, sigma=first.sigma_normal_rad),
+        ),
+        prior=prior,
+        mean=np.concatenate([mean, np.zeros(k)]),
+    )
+    found = replace(
+        at_(end.at),
+        covariance=end.covariance,
+        redundancy=end.spare[0],
+        sigma_position_m=end.sigmas[0],
+        sigma_normal_rad=end.sigmas[1],
+    )
     if considered is None or not k:
         return found
     # at the errors found: what one standard deviation of each other error does to the estimate
@@ -255,8 +256,9 @@ def fit_kinematics(
         after=inverse(flange_poses(errors.arm, q, np.zeros((errors.arm.n, 6))))
         @ found.errors.moved(q, data.after, found.u),
     )
-    Jc = _jacobian(other, moved, q)[:, 6 + terms :] * w[:, None]
-    gain = found.covariance @ Jw.T @ Jc
+    weights = np.concatenate([1.0 / (own + end.sigmas[0] ** 2), data.has / end.sigmas[1] ** 2])
+    w = np.repeat(weights, 3)[:, None]
+    gain = found.covariance @ (_jacobian(found, data, q) * w).T @ _jacobian(other, moved, q)[:, 6 + terms :]
     square = np.diag(found.covariance) + (gain**2).sum(axis=1)
     return replace(found, sigma_considered=np.sqrt(square[-k:]))
 

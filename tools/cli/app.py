@@ -85,10 +85,6 @@ def _typer_command(name: str, entry: Entry) -> Any:
     return typer.main.get_command(alone)
 
 
-YES_NO = ("motions", "scanner-correction")
-"""Keys of --as that were options without a value."""
-
-
 class KeyedCommand(TyperCommand):
     """A command that names the key of --as for an option that became one."""
 
@@ -100,9 +96,11 @@ class KeyedCommand(TyperCommand):
             name, attached, value = word.partition("=")
             key = name[2:].removeprefix("no-")
             if name.startswith("--") and key in self.keys:
+                from weldcal.tools.cli.options import KEYS, YES_NO  # only here: app.py starts without the options
+
                 if not attached:
                     value = "".join(word for word in args[after : after + 1] if not word.startswith("-"))
-                if key in YES_NO and value not in ("yes", "no"):
+                if KEYS[key] is YES_NO and value not in ("yes", "no"):
                     value = "no" if name.startswith("--no-") else "yes"
                 ctx.fail(f"The option {name} is a key of --as now: write --as {shlex.quote(f'{key}={value}')}.")
         return super().parse_args(ctx, args)

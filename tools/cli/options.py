@@ -233,13 +233,14 @@ def _check_numbers(given: Mapping[str, Any]) -> None:
 
 
 _FORM, _MM = ("a form, such as euler_xyz,deg", str), ("a number of millimetres", float)
-_YES_NO = ("yes or no", {"yes": True, "no": False}.__getitem__)
+YES_NO = ("yes or no", {"yes": True, "no": False}.__getitem__)
+"""What the value is of a key that was an option without one."""
 KEYS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "robot-form": _FORM,
     "camera-form": _FORM,
     "intrinsics": ("a file", Path),
-    "motions": _YES_NO,
-    "scanner-correction": _YES_NO,
+    "motions": YES_NO,
+    "scanner-correction": YES_NO,
     "sensor-correction": ("a file or folder", Path),
     "set": ("a name", str),
     "trial": ("a whole number", int),

@@ -81,8 +81,8 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():
         raise InputError(
-            f"'{folder}' is a result of an older version, without the flange of each scan. Calibrate again, or give"
-            " the dataset's folder."
+            f"'{folder}' holds a pose without the scans that it came from (no {NAME}). Give the folder of the"
+            " calibration, or that of the dataset."
         )
     return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
 

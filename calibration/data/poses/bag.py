@@ -1,17 +1,22 @@
-"""Reads scans and flange poses from ROS recordings (MCAP, ROS 2 .db3, ROS 1 .bag) by the optional package rosbags."""
+"""Reads scans and poses from ROS recordings (MCAP, ROS 2 .db3, ROS 1 .bag) by the optional package rosbags."""
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.names import BASES, FLANGES
+from weldcal.calibration.data.poses.listing import Listing, listing_of
+from weldcal.calibration.data.poses.names import BASES, FLANGES, whose
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import angle_of, inverse, pose
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.calibration.geometry.se3 import angle_of, inverse, mean_pose, pose
+from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.files import MOST_POINTS
 
@@ -20,9 +25,14 @@ INSTALL = "pip install 'weldcal[ros]'"
 _AROUND_S = 0.25  # over which the arm must have rested at a scan
 _REST_M, _REST_RAD = 3e-4, 1e-3
 _SAME_M, _SAME_RAD = 1e-3, 3e-3  # scans at poses nearer than this are one
+FEWEST_RESTS = 6
+"""Rests from which on the poses at rest are taken, else those in motion: a choice, above the ends of a motion."""
 _MOST_CLOUDS = 500
 _KINDS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}  # sensor_msgs/PointField
-_CLOUD, _POSE, _JOINTS, _TF = "PointCloud2", "PoseStamped", "JointState", "TFMessage"
+_CLOUD, _JOINTS, _TF = "PointCloud2", "JointState", "TFMessage"
+_POSES = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+# a board or a tag in the names that detectors give their frames (aruco_ros, apriltag_ros, ar_track_alvar, easy_handeye)
+_BOARD = re.compile(r"(?i)aruco|marker|april|(?<![a-z])tag(?![a-z])|board|checker|chess|pattern|target|fiducial")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +77,15 @@ def find_bag(folder: Path) -> Path | None:
     return inside[0] if inside else None
 
 
+def has_clouds(folder: Path) -> bool:
+    """Return whether this is a recording with clouds: False of another file or folder, and of poses alone."""
+    bag = find_bag(folder)
+    if bag is None:
+        return False
+    with _opened(bag) as reader:
+        return any(c.msgtype.endswith(_CLOUD) for c in reader.connections)
+
+
 def read_bag(path: Path, form: PoseForm, robot: str) -> BagScans:
     """Clouds of a recording with the flange's pose at the stamp of each, of the moments at which the arm rested.
 
@@ -76,6 +95,29 @@ def read_bag(path: Path, form: PoseForm, robot: str) -> BagScans:
     Raises:
         DatasetError: rosbags is not installed, the file is damaged, or there are no clouds or no poses.
     """
+    streams = _Poses()
+    clouds: list[tuple[float, Array]] = []
+    with _opened(path) as reader:
+        kinds = {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
+        topic = _cloud_topic(path, kinds, form)
+        for of, message, stamp in _messages(reader, (topic,)):
+            if of != topic:
+                _collect(streams, of, kinds[of], message, stamp)
+                continue
+            if len(clouds) == _MOST_CLOUDS:
+                raise DatasetError(
+                    f"'{path.name}' holds more than {_MOST_CLOUDS} clouds on {topic}; record scans at rest."
+                )
+            clouds.append((_time(message.header, stamp), _points(path, message)))
+    if not clouds:
+        raise DatasetError(f"'{path.name}' holds no cloud on {topic}.")
+    times, X, said = _flange(path, streams, form, robot)
+    return _at_rest(path, clouds, times, X, f"{said} and {topic}")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a recording; whatever its reader raises becomes a DatasetError."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -83,23 +125,9 @@ def read_bag(path: Path, form: PoseForm, robot: str) -> BagScans:
         raise DatasetError(
             f"'{path.name}' is a ROS recording; to read it, install the package for it: {INSTALL}."
         ) from None
-    streams = _Poses()
-    clouds: list[tuple[float, Array]] = []
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            kinds = {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
-            topic = _cloud_topic(path, kinds, form)
-            wanted = [c for c in reader.connections if c.topic == topic or kinds[c.topic] in (_POSE, _JOINTS, _TF)]
-            for connection, stamp, raw in reader.messages(connections=wanted):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                if connection.topic == topic:
-                    if len(clouds) == _MOST_CLOUDS:
-                        raise DatasetError(
-                            f"'{path.name}' holds more than {_MOST_CLOUDS} clouds on {topic}; record scans at rest."
-                        )
-                    clouds.append((_time(message.header, stamp), _points(path, message)))
-                else:
-                    _collect(streams, connection.topic, kinds[connection.topic], message, stamp)
+            yield reader
     except DatasetError:
         raise
     except MemoryError:
@@ -108,10 +136,94 @@ def read_bag(path: Path, form: PoseForm, robot: str) -> BagScans:
         raise DatasetError(
             f"'{path.name}' cannot be read as a ROS recording: {' '.join(str(e).split())[:200] or type(e).__name__}."
         ) from e
-    if not clouds:
-        raise DatasetError(f"'{path.name}' holds no cloud on {topic}.")
-    times, X, said = _flange(path, streams, form, robot)
-    return _at_rest(path, clouds, times, X, f"{said} and {topic}")
+
+
+def _messages(reader: Any, topics: tuple[str, ...] = ()) -> Iterator[tuple[str, Any, int]]:
+    """Topic, message and arrival (ns) of all poses, joint angles and transforms, and of these topics."""
+    known = (*_POSES, _JOINTS, _TF)
+    wanted = [c for c in reader.connections if c.topic in topics or c.msgtype.split("/")[-1] in known]
+    for connection, stamp, raw in reader.messages(connections=wanted):
+        yield connection.topic, reader.deserialize(raw, connection.msgtype), stamp
+
+
+def lists_of_recording(path: Path, arm: str = "") -> list[Listing]:
+    """Every list of stamped poses of a recording, in metres: topics of poses, the flange by tf or joint angles, boards.
+
+    Raises:
+        DatasetError: as read_bag; or the recording holds pictures where poses of a board are needed.
+    """
+    streams = _Poses()
+    with _opened(path) as reader:
+        kinds = {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
+        for topic, message, stamp in _messages(reader):
+            _collect(streams, topic, kinds[topic], message, stamp)
+    found = [
+        (_named(topic, "camera") if _BOARD.search(topic) else topic, *_table(rows))
+        for topic, rows in streams.poses.items()
+    ]
+    for (parent, child), rows in streams.transforms.items():
+        if len(rows) > 1 and bool(_BOARD.search(child)) != bool(_BOARD.search(parent)):
+            found.append((_named(f"tf from {parent} to {child}", "camera"), *_table(rows)))
+    flange = _chained(path, streams, PoseForm(), needed=False) if streams.transforms else None
+    if flange is not None:
+        found.append((_named(flange[2], "robot"), flange[0], flange[1]))
+    lists = [
+        listing_of(
+            name, X[:, :3, 3], X[:, :3, :3], rotation="matrix", firm=True, unit="m", times=t, form="stamped poses"
+        )
+        for name, t, X in found
+    ]
+    if flange is None:
+        lists += [_joints(path, topic, samples, arm) for topic, samples in streams.joints.items()]
+    pictures = [topic for topic, kind in kinds.items() if kind in ("Image", "CompressedImage")]
+    if pictures and len(lists) < 2:
+        raise DatasetError(
+            f"'{path.name}' holds pictures ({pictures[0]}) and no poses of a board. Export them with the robot's poses"
+            " into a folder, and name the board with --board."
+        )
+    return lists
+
+
+def _joints(path: Path, topic: str, samples: list[tuple[float, tuple[str, ...], Array]], arm: str) -> Listing:
+    """Return the list of joint angles of a topic, as poses where the arm is named."""
+    rows = sorted(samples, key=lambda sample: sample[0])
+    order = _order(path, rows[0][1], load_chain(arm).n if arm else min(6, len(rows[0][1])))
+    q, times = np.array([row[2][order] for row in rows]), np.array([row[0] for row in rows])
+    name = _named(topic, "robot")
+    return Listing(name=name, numbers=(), times=times, joints=q, form=f"joint angles of {topic}").of_arm(arm)
+
+
+def _named(name: str, who: str) -> str:
+    """Return a name that says whose list it is."""
+    return name if whose(name) == who else f"{who}: {name}"
+
+
+def at_rest(robot: Listing, camera: Listing) -> list[Listing] | None:
+    """Return the poses of two streams where the arm rested, one pair for each rest; None of fewer than FEWEST_RESTS.
+
+    Of the camera's poses within a rest, the mean rotation and the median position.
+    """
+    X, C, t = robot.readings[0].X, camera.readings[0].X, camera.times
+    assert robot.times is not None
+    assert t is not None
+    at, still = _still(robot.times, X, t)
+    still &= (t > robot.times[0]) & (t < robot.times[-1])
+    rests: list[list[int]] = []
+    for k in np.flatnonzero(still).tolist():
+        off, turn = _apart(at[rests[-1][0]], at[k]) if rests else (np.inf, np.inf)
+        if off <= _SAME_M and turn <= _SAME_RAD:
+            rests[-1].append(k)
+        else:
+            rests.append([k])
+    if len(rests) < FEWEST_RESTS:
+        return None
+    form = f"at rest, {sum(map(len, rests))} of {len(t)} stamps"
+    poses = np.array([at[rest[len(rest) // 2]] for rest in rests])
+    means = np.array([mean_pose(C[rest]) for rest in rests])
+    return [
+        listing_of(one.name, Y[:, :3, 3], Y[:, :3, :3], rotation="matrix", firm=True, unit="m", form=form)
+        for one, Y in ((robot, poses), (camera, means))
+    ]
 
 
 def _cloud_topic(path: Path, kinds: dict[str, str], form: PoseForm) -> str:
@@ -165,10 +277,11 @@ def _collect(streams: _Poses, topic: str, kind: str, m: Any, arrival_ns: int) ->
         streams.joints.setdefault(topic, []).append(
             (_time(m.header, arrival_ns), tuple(m.name), np.asarray(m.position, dtype=float))
         )
-    elif kind == _POSE:
-        streams.poses.setdefault(topic, []).append(
-            (_time(m.header, arrival_ns), _pose(m.pose.position, m.pose.orientation))
-        )
+    elif kind in _POSES:
+        at = getattr(m, "pose", None)
+        at = getattr(at, "pose", at)
+        place = (m.transform.translation, m.transform.rotation) if at is None else (at.position, at.orientation)
+        streams.poses.setdefault(topic, []).append((_time(m.header, arrival_ns), _pose(*place)))
     else:
         for t in m.transforms:
             edge = (t.header.frame_id.strip("/"), t.child_frame_id.strip("/"))
@@ -200,21 +313,14 @@ def _flange(path: Path, s: _Poses, form: PoseForm, robot: str) -> tuple[Array, A
         times, X = _table(s.poses[stamped[0]])
         return times, X, stamped[0]
     if s.transforms and form.topic in ("", "/tf", "tf"):
-        found = _chained(path, s, form, needed=not s.joints)
-        if found is not None:
-            return found
+        chained = _chained(path, s, form, needed=not s.joints)
+        if chained is not None:
+            return chained
     angles = [t for t in s.joints if form.topic in ("", t)]
     if len(angles) == 1:
-        if not robot:
-            raise DatasetError(
-                f"'{path.name}' holds joint angles ({angles[0]}); name the arm, 'robot:' in dataset.yaml or --robot,"
-                " for its kinematics."
-            )
-        arm = load_chain(robot)
-        rows = sorted(s.joints[angles[0]], key=lambda r: r[0])
-        order = _order(path, rows[0][1], arm.n)
-        q = np.array([r[2][order] for r in rows])
-        return np.array([r[0] for r in rows]), chain_poses(arm, q), f"{angles[0]} with the kinematics of {robot}"
+        found = _joints(path, angles[0], s.joints[angles[0]], robot)
+        X = found.readings[0].X
+        return np.asarray(found.times), X, found.form
     raise DatasetError(
         f"'{path.name}' holds no poses of the flange: neither PoseStamped, nor tf from base to flange, nor JointState."
     )
@@ -295,30 +401,20 @@ def _at_rest(path: Path, clouds: list[tuple[float, Array]], times: Array, X: Arr
     kept: list[tuple[str, Array, Array, float]] = []
     refused: list[tuple[str, str]] = []
     digits = len(str(len(clouds)))
+    at, still = _still(times, X, np.array([t for t, _ in clouds]))
     for k, (t, points) in enumerate(clouds, start=1):
         id = f"scan{k:0{max(2, digits)}d}"
         if not times[0] - _AROUND_S <= t <= times[-1] + _AROUND_S:
-            refused.append(
-                (
-                    id,
-                    (
-                        f"It was taken {min(abs(t - times[0]), abs(t - times[-1])):.1f} s before or after the poses"
-                        " were recorded."
-                    ),
-                )
-            )
+            late = min(abs(t - times[0]), abs(t - times[-1]))
+            refused.append((id, f"It was taken {late:.1f} s before or after the poses were recorded."))
             continue
-        near = _at(times, X, np.array([t - _AROUND_S, t, t + _AROUND_S]))
-        if (
-            max(_apart(near[0], near[1])[0], _apart(near[2], near[1])[0]) > _REST_M
-            or max(_apart(near[0], near[1])[1], _apart(near[2], near[1])[1]) > _REST_RAD
-        ):
+        if not still[k - 1]:
             refused.append((id, "The arm moved while it was taken."))
             continue
-        if any(d <= _SAME_M and a <= _SAME_RAD for d, a in (_apart(near[1], other) for _, other, _, _ in kept)):
+        if any(d <= _SAME_M and a <= _SAME_RAD for d, a in (_apart(at[k - 1], other) for _, other, _, _ in kept)):
             refused.append((id, "It was taken at the same pose as an earlier one; it counts once."))
             continue
-        kept.append((id, near[1], points, t))
+        kept.append((id, at[k - 1], points, t))
     if not kept:
         raise DatasetError(f"'{path.name}' has no scan taken at rest: {refused[0][0]}: {refused[0][1]}")
     return BagScans(
@@ -329,6 +425,16 @@ def _at_rest(path: Path, clouds: list[tuple[float, Array]], times: Array, X: Arr
         said,
         tuple(refused),
     )
+
+
+def _still(times: Array, X: Array, when: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Poses (n, 4, 4) at times (n,) s, and whether the arm rested about each."""
+    at = _at(times, X, when)
+    still = np.ones(len(when), dtype=bool)
+    for one in (_at(times, X, when - _AROUND_S), _at(times, X, when + _AROUND_S)):
+        still &= np.linalg.norm(one[:, :3, 3] - at[:, :3, 3], axis=1) <= _REST_M
+        still &= angle_of(np.swapaxes(one[:, :3, :3], 1, 2) @ at[:, :3, :3]) <= _REST_RAD
+    return at, still
 
 
 def _apart(A: Array, B: Array) -> tuple[float, float]:

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.bag import FEWEST_RESTS, at_rest, find_bag, lists_of_recording
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists
+from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists, two_lists
 from weldcal.calibration.data.poses.names import ENDINGS, mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
@@ -94,14 +95,14 @@ def read_pairs(
     Raises:
         DatasetError: the file cannot be read; InconsistentPoses: the data do not select one reading.
     """
-    path = Path(path)
+    path, stated = Path(path), stated or StatedForms()
     if path.is_dir() and (path / "pairs.npz").exists():
         path = path / "pairs.npz"
     mounting = None if mounting is None else mounting_name(mounting)
     if length is not None and (length.count(",") > 1 or not set(length.split(",")) <= set(LENGTHS)):
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}, or inch,mm for robot and camera.")
     try:
-        return _pairs(path, *_contents(path), mounting, length, stated or StatedForms())
+        return _pairs(path, *_contents(path, stated), mounting, length, stated)
     except (DatasetError, InconsistentPoses):
         raise
     except InputError as e:
@@ -180,8 +181,28 @@ def _pairs(
     )
 
 
-def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
+def recorded_lists(path: Path, stated: StatedForms) -> tuple[Listing, Listing] | None:
+    """Return the robot's and the camera's stamped poses of a ROS recording; None where there are others or none."""
+    beside = path.iterdir() if path.is_dir() else ()
+    if any(p.suffix.lower() in ENDINGS and p.name not in ("dataset.yaml", "metadata.yaml") for p in beside):
+        return None
+    bag = find_bag(path) if path.exists() else None
+    if bag is None:
+        return None
+    lists = lists_of_recording(bag, stated.arm or "")
+    return two_lists(lists, path.name, stated.robot_poses, stated.camera_poses)
+
+
+def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], dict[str, Any]]:
     """Return the lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
+    recorded = recorded_lists(path, stated)
+    if recorded is not None:
+        if (lists := at_rest(*recorded)) is None:
+            raise DatasetError(
+                f"'{path.name}' has fewer than {FEWEST_RESTS} poses at which the arm rested and the camera saw the"
+                " board: let the arm rest for a second at each pose, and record again."
+            )
+        return lists, {}
     if path.is_dir():
         description = path / "dataset.yaml"
         raw = read_tree(description) if description.is_file() else {}
@@ -201,12 +222,6 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         }
     file_size(path)
     ending = path.suffix.lower()
-    if ending in (".bag", ".db3", ".mcap"):
-        raise DatasetError(
-            f"'{path.name}' is a ROS recording, which is not read. Write the robot's and the camera's poses as"
-            " robot.csv and camera.csv (rostopic echo -p, or ros2 topic echo --csv) into a folder, and give that"
-            " folder."
-        )
     if ending in (".pkl", ".pickle"):
         raise DatasetError(PICKLED.format(path.name))
     if ending == ".npz":

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import open3d
 import pytest
+import yaml
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from typer.testing import CliRunner
 
@@ -147,6 +148,16 @@ def test_a_rotation_changed_by_hand_is_noticed(result: CalibrationResult, tmp_pa
     assert first in text
     path.write_text(text.replace(first, "0.5"))
     with pytest.raises(InputError, match="not orthonormal"):
+        load_result(path)
+
+
+@pytest.mark.parametrize("key", ["xyz", "wxyz"])
+def test_a_pose_changed_in_one_of_its_forms_is_refused(result: CalibrationResult, tmp_path: Path, key: str) -> None:
+    path = save_result(result, tmp_path)
+    document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    document["X_BC"][key][0] += 2e-5
+    path.write_text(yaml.safe_dump(document), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"X_BC.matrix and X_BC.{key} differ: change both"):
         load_result(path)
 
 
