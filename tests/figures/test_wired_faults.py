@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from tests.figures.robot.wired import FLAT_MB_H, grows, growth
+from tests.worlds.robot.played import Bridge, PictureBridge, ScannerBridge
 from tests.worlds.robot.wired_job import DEVICES, FAULTS, PHASES, Happening
-from weldcal.tools.emulators.cell.process import Bridge, PictureBridge, ScannerBridge
 from weldcal.tools.emulators.cell.wires import DELAY_S, InputWire
 
 HOST = "127.0.0.1"

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.worlds.robot.played import Played, played_world
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.tools.commands.monitor import LiveMonitor, monitor_live
 from weldcal.tools.commands.motion_live import MotionOutcome, run_motion_live
-from weldcal.tools.emulators.cell.process import Played, played_world
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
 from weldcal.tools.report.run import RunOptions
 

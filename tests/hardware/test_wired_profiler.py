@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.worlds.robot.played import Played, played_world
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.models.arms.kinematics import forward_kinematics
@@ -25,7 +26,6 @@ from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.tools.commands.profiler.live import run_profiler_live
-from weldcal.tools.emulators.cell.process import Played, played_world
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
 from weldcal.tools.report.profiler_live import ProfilerLive
 from weldcal.tools.report.run import RunOptions

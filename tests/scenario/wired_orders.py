@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from tests.worlds.robot.played import wired_world
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import run_scenario
-from weldcal.tools.emulators.cell.process import wired_world
 from weldcal.tools.report.run import RunOptions
 
 SEAM_MM = 80.0

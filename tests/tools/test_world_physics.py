@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.worlds.robot.played import WORLD
 from weldcal.calibration.planning.clearance import TOOL, LinkCapsule, lowest_point
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.tools.emulators.cell.physics import STEP_S, STILL_FRAMES, Physics, to_the_wire
-from weldcal.tools.emulators.cell.process import WORLD
 from weldcal.tools.emulators.cell.wires import Arc
 
 TURN_RAD = 0.05

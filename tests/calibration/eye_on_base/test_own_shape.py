@@ -171,5 +171,5 @@ def test_a_part_without_a_ring_or_with_two_is_refused(tmp_path: Path) -> None:
     triangles, *_ = boss(np.random.default_rng([4, 93]))
     sideways = RigidTransform(RollPitchYaw(0.0, np.pi / 2, 0.0), [0.0, 0.0, 0.0])
     write_stl(tmp_path / "cap.stl", [np.array([sideways @ p for p in t]) for t in triangles])
-    with pytest.raises(InputError, match="rings, and none of the widest that look along z. Turn the part"):
+    with pytest.raises(InputError, match=r"rings, and none of the widest that look along z. Turn the part"):
         own_ring(tmp_path / "cap.stl")

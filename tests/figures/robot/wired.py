@@ -14,10 +14,10 @@ import numpy as np
 from scipy import stats
 
 from tests.figures.harness import Missed, Run, figure
+from tests.worlds.robot.played import WiredWorld, wired_world
 from tests.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.console import Progress
-from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.report.render import fixed, mappings_csv, write_atomic
 
 SEAM_MM = 20.0

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.worlds.robot.played import WiredWorld
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import Lateness, WallClock
 from weldcal.tools.commands.weld import run_scenario
-from weldcal.tools.emulators.cell.process import WiredWorld
 from weldcal.tools.emulators.ur.process import Emulator
 from weldcal.tools.report.run import RunOptions
 
