@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -13,7 +13,9 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.models.tools.elastomers import Elastomer
+
+if TYPE_CHECKING:
+    from weldcal.models.tools.elastomers import Elastomer
 
 RING = get_flange("tool-ring-63")
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
@@ -93,7 +95,7 @@ class WeldingTool:
     lateral_stiffness_N_per_m: float = 600.0
     axial_stiffness_N_per_m: float = 300.0
     damping_N_s_per_m: float = 3.0
-    memory: Elastomer | None = None  # creep and loss of the springs; None: none
+    memory: "Elastomer | None" = None  # creep and loss of the springs; None: none
     tag_reach_m: float = 0.110  # p_FM along +z_F
     tag_size_m: float = 0.010
     tag_dictionary: str = "4X4_50"

@@ -189,15 +189,11 @@ def pose_document(X: RigidTransform) -> dict[str, Any]:
 
 
 def pose_of_document(section: DocumentSection, refusal: str) -> RigidTransform:
-    """The pose of a document's ``matrix``.
-
-    Raises InputError with the sentence ``refusal`` where it is not rigid, and where ``xyz`` or ``wxyz`` is another pose.
-    """
+    """The pose of a document's ``matrix``. Raises InputError where it is not rigid, or not that of xyz and wxyz."""
     M = section.array("matrix", 4, 4)
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
         raise InputError(refusal)
-    X = as_transform(M)
-    for key, own in list(pose_document(X).items())[1:]:
+    for key, own in list(pose_document(X := as_transform(M)).items())[1:]:
         if section.has(key) and not np.allclose(section.array(key, len(own)), own, atol=1e-5):  # five printed decimals
             raise InputError(f"'{section.file}': {section.place}.matrix and {section.place}.{key} differ: change both.")
     return X
@@ -341,10 +337,7 @@ def load_result(path: Path) -> CalibrationResult:
 
 
 def _covariance(d: DocumentSection, key: str, size: int) -> Array:
-    """Return the matrix (size, size) of a covariance.
-
-    Raises InputError where it is not symmetric or has a negative variance.
-    """
+    """Return the matrix (size, size) of a covariance. Raises InputError where it is none."""
     C = d.section(key).array("matrix", size, size)
     scale = np.sqrt(np.abs(np.diag(C)))
     scale[scale == 0.0] = 1.0

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
@@ -15,9 +16,11 @@ from weldcal.models.documents import read_document, read_part
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange, is_part_file
 from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, ToolShape, WeldingTool
-from weldcal.models.tools.elastomers import MATERIALS, Elastomer
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
+
+if TYPE_CHECKING:
+    from weldcal.models.tools.elastomers import Elastomer
 
 Triple = tuple[float, float, float]
 
@@ -325,14 +328,16 @@ def _check_sizes(file: str, part: ToolPart) -> None:
         )
 
 
-def _memory(file: str, tip: TipPart) -> Elastomer | None:
+def _memory(file: str, tip: TipPart) -> "Elastomer | None":
     """Return what the tip remembers, None where the file states nothing of it."""
-    if tip.material and tip.material not in MATERIALS:
-        raise InputError(f"'{file}': tip.material must be one of {', '.join(MATERIALS)}, not '{tip.material}'.")
     keys = ("relaxation_s", "creep_share", "loss_share")
     given = {key: value for key in keys if (value := getattr(tip, key)) is not None}
     if not tip.material and not given:
         return None
+    from weldcal.models.tools.elastomers import MATERIALS  # only here: few files describe it so far
+
+    if tip.material and tip.material not in MATERIALS:
+        raise InputError(f"'{file}': tip.material must be one of {', '.join(MATERIALS)}, not '{tip.material}'.")
     if not tip.material and len(given) < len(keys):
         raise InputError(f"'{file}': tip needs {', '.join(keys)} together, or a material that gives the others.")
     found = dc.replace(MATERIALS.get(tip.material, MATERIALS["silicone"]), **given)

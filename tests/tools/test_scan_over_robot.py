@@ -20,7 +20,7 @@ from weldcal.models.arms.shape import arm_shape
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.dashboard.recording import scan_page
+from weldcal.tools.dashboard.scan_overlay import scan_page
 from weldcal.tools.recorded import calibrate_dataset
 
 AUBO = SHARED_DATA / "flange" / "aubo_i5_phoxi_s"

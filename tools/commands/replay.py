@@ -223,8 +223,7 @@ def _scan_pages(
     """Write overlay.html and overlay.png of a scan; the page, and its distances for JSON and as rows."""
     # only here: another view needs none of these
     from weldcal.calibration.recorded_overlay import overlay
-    from weldcal.tools.dashboard.recording import scan_page
-    from weldcal.tools.report.pictures import overlay_picture
+    from weldcal.tools.dashboard.scan_overlay import overlay_picture, scan_page
 
     call.progress("distances from the robot", 0.0)
     found = overlay(result, dataset, scan, robot)

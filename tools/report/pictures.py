@@ -13,8 +13,6 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
@@ -22,12 +20,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arrays import Array
-from weldcal.systems.viewer.scene import diverging
 
 if TYPE_CHECKING:
     from weldcal.calibration.flange.fit import FlangeFit
     from weldcal.calibration.flange.observation import Observation
-    from weldcal.calibration.recorded_overlay import Overlay
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
 PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
@@ -111,8 +107,6 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
 
 MOST_SCANS = 48  # a choice: a page of eight rows; more would take megabytes and seconds
 _POINTS = 1500  # drawn a scan: a choice, dense at this size
-_INK = 5e4  # points of print squared that the dots of an overlay cover: about its half, a choice
-_DRAWN = 200_000  # of an overlay: a choice, more hide each other at this size
 _HEIGHT_MM = 0.3  # of the colours' ends: a choice, beyond the noise of a good scanner
 
 
@@ -139,33 +133,6 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
         axes.plot(0.0, 0.0, "+", color="#111", markersize=5, markeredgewidth=0.8)
         axes.set_aspect("equal")
         axes.set_title(id, fontsize=7, pad=2)
-    return png(figure)
-
-
-def overlay_colours(found: Overlay) -> NDArray[np.uint8]:
-    """Colours (N, 3) RGB of a scan's points: by distance from the robot (blue: inside), others grey."""
-    share = 1e3 * np.nan_to_num(found.distance) / found.scale_mm
-    return np.where(found.body[:, None] < 0, np.uint8(70), diverging(share))
-
-
-def overlay_picture(found: Overlay) -> bytes:
-    """Draw a scan as the scanner sees it, its points on the robot by distance from the surface; PNG."""
-    limit, on, size = found.scale_mm, found.body >= 0, found.rows["robot"]
-    seen = 1e3 * found.X_BC.inverse().multiply(found.points_B.T)[:2]
-    figure, axes = subplots(6.8, 5.6)
-    axes.set_facecolor("#22262b")  # the pale middle of the colours shows on it
-    drawn = np.random.default_rng(0).permutation(len(on))[:_DRAWN]
-    dot = min(9.0, _INK / np.count_nonzero(on[drawn]))
-    axes.scatter(*seen[:, drawn], c=overlay_colours(found)[drawn] / 255.0, s=dot, linewidths=0)
-    (left, top), (right, bottom) = np.percentile(seen[:, on], [0.1, 99.9], axis=1)
-    margin = 0.08 * max(right - left, bottom - top)
-    axes.set(xlim=(left - margin, right + margin), ylim=(bottom + margin, top - margin), aspect="equal")
-    lengths = "{points} points on it, median {median_mm:.2f}, 95 % {p95_mm:.2f}, signed median {signed_mm:+.2f} mm"
-    axes.set_title(f"scan {found.scan}, distance from the robot:\n{lengths.format(**size)}", fontsize=10, loc="left")
-    axes.set(xlabel="camera x, mm", ylabel="camera y, mm")
-    colours = ListedColormap(diverging(np.linspace(-1.0, 1.0, 255)) / 255.0)
-    bar = ScalarMappable(Normalize(-limit, limit), colours)
-    figure.colorbar(bar, ax=axes, extend="both", label="mm from the surface (below 0: inside; grey: not on the robot)")
     return png(figure)
 
 

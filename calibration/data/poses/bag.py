@@ -1,24 +1,28 @@
 """Reads scans and poses from ROS recordings (MCAP, ROS 2 .db3, ROS 1 .bag) by the optional package rosbags."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.listing import Listing, listing_of
 from weldcal.calibration.data.poses.names import BASES, FLANGES, whose
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import angle_of, inverse, mean_pose, pose
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.files import MOST_POINTS
+
+if TYPE_CHECKING:
+    from weldcal.calibration.data.poses.listing import Listing
 
 ENDINGS = (".mcap", ".db3", ".bag")
 INSTALL = "pip install 'weldcal[ros]'"
@@ -152,6 +156,8 @@ def lists_of_recording(path: Path, arm: str = "") -> list[Listing]:
     Raises:
         DatasetError: as read_bag; or the recording holds pictures where poses of a board are needed.
     """
+    from weldcal.calibration.data.poses.listing import listing_of  # only here: a recording of scans needs no lists
+
     streams = _Poses()
     with _opened(path) as reader:
         kinds = {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
@@ -186,6 +192,8 @@ def lists_of_recording(path: Path, arm: str = "") -> list[Listing]:
 
 def _joints(path: Path, topic: str, samples: list[tuple[float, tuple[str, ...], Array]], arm: str) -> Listing:
     """Return the list of joint angles of a topic, as poses where the arm is named."""
+    from weldcal.calibration.data.poses.listing import Listing  # only here, as above
+
     rows = sorted(samples, key=lambda sample: sample[0])
     order = _order(path, rows[0][1], load_chain(arm).n if arm else min(6, len(rows[0][1])))
     q, times = np.array([row[2][order] for row in rows]), np.array([row[0] for row in rows])
@@ -203,6 +211,8 @@ def at_rest(robot: Listing, camera: Listing) -> list[Listing] | None:
 
     Of the camera's poses within a rest, the mean rotation and the median position.
     """
+    from weldcal.calibration.data.poses.listing import listing_of  # only here, as above
+
     X, C, t = robot.readings[0].X, camera.readings[0].X, camera.times
     assert robot.times is not None
     assert t is not None

@@ -28,7 +28,6 @@ from weldcal.models.flanges import flange_mesh
 from weldcal.models.robots import BaseCircle
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.bodies.relaxing_tip import RelaxingTip
 from weldcal.systems.bodies.tool import (
     STEEL,
     TABLE,
@@ -188,7 +187,12 @@ def build_world(
     compensate_gravity(builder, plant, moved)
     if tool_instance is not None:
         memory = None if tool is None else tool.memory
-        source = ConstantVectorSource(np.zeros(6)) if memory is None else RelaxingTip(memory, setup.time_step_s)
+        if memory is None:
+            source = ConstantVectorSource(np.zeros(6))
+        else:
+            from weldcal.systems.bodies.relaxing_tip import RelaxingTip  # only here: few tips are described so far
+
+            source = RelaxingTip(memory, setup.time_step_s)
         rest = builder.AddNamedSystem("tip_at_rest", source)
         if memory is not None:
             builder.Connect(plant.get_state_output_port(tool_instance), rest.get_input_port())

@@ -45,7 +45,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.monitor_body import track_link
 from weldcal.tools.console import Progress
-from weldcal.tools.report.pictures import overlay_picture
+from weldcal.tools.dashboard.scan_overlay import overlay_picture
 
 LINK = "wrist_1_link"
 Draw = Callable[[MotionDataset, CalibrationResult, DriftHistory], None]
