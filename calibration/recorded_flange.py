@@ -332,10 +332,15 @@ def _unconfirmed(
     if verdict is None or verdict.accepted is None:
         return estimate, ()
     left = 1e3 * float(np.nanmean(wanted.held_out.position_m))
+    shown = (
+        f"fewer than {_CONFIRMING} scans show the flange's hole circle"
+        if scans.standard.n_holes
+        else "no hole circle is there"
+    )
     sentence = (
         "The scanner is not corrected: the robot's motion asks for a scale of"
         f" {1e2 * (verdict.accepted.scale - 1.0):+.2f} %, with which the held-out errors would be {left:.3f} mm (mean),"
-        f" but fewer than {_CONFIRMING} scans show the flange's hole circle to confirm it."
+        f" but {shown} to confirm it."
     )
     return estimate, (sentence,)
 

@@ -30,6 +30,8 @@ from weldcal.models.robots import get_robot, stated_flange
 BAND_M = 0.02  # a choice, twice what a calibration by a tape measure leaves
 """A point so near to the robot's surface belongs to the robot."""
 _SCALES_MM = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 1e3 * BAND_M)  # a choice: read at once
+_FACE = 0.97  # of the flange's radius, a choice: farther out a point may be of what stands behind it
+_SAME_M = 5e-3  # a factory calibration moves the flange by no more
 _NO_JOINTS = "The scans have no joint angles (q1, q2 ...)"
 
 
@@ -115,9 +117,15 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
         X_BF, q = data.poses[id], None if angles is None else angles[0]
     if q is None and robot is not None:
         raise InputError(f"{_NO_JOINTS}, by which --robot places the links: add them, or omit --robot.")
+    reached = X_BF if q is None else chain_forward(load_chain(name, kinematics), q)
+    if (off := float(np.linalg.norm(reached.translation() - X_BF.translation()))) > _SAME_M:
+        raise InputError(
+            f"The joint angles of scan '{id}' put the flange of the {name} {1e3 * off:.0f} mm from its recorded pose:"
+            " give them in rad, and name the arm that was moved by --robot."
+        )
     bodies, note = _links(name, q, kinematics)
-    if q is not None and kinematics is not None:
-        X_BF = chain_forward(load_chain(name, kinematics), q)  # as in that calibration
+    if kinematics is not None:
+        X_BF = reached  # as in that calibration
     standard, in_hand = stated_flange(data.header.flange, name), data.header.configuration == IN_HAND
     bodies.append(BodyShape("flange", X_BF if in_hand else X_BF @ data.X_FR, [flange_mesh(standard)]))
     if isinstance(seen := own.get("target"), Mapping):
@@ -128,6 +136,10 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
     X_BC = X_BF @ X if in_hand else X
     points_B = X_BC.multiply((points if correction is None else correction.points(points)).T).T
     distance, body = compare(points_B, bodies)
+    if q is None:  # the wrist behind the flange has no shape here
+        aside = (bodies[0].X_BL.inverse().multiply(points_B.T))[:2]
+        other = (body == 0) & (np.linalg.norm(aside, axis=0) > _FACE * 0.5 * standard.outer_m)
+        distance[other], body[other] = np.nan, -1
     if (body < 0).all():
         where = f"within {1e3 * BAND_M:.0f} mm of the robot"
         raise InputError(f"No point of scan '{id}' lies {where}: check that '{result}' belongs to '{dataset}'.")
@@ -150,7 +162,7 @@ def _in_motion(data: MotionDataset, id: str, own: Mapping[str, Any]) -> tuple[Ri
 def _links(name: str, q: Array | None, kinematics: Path | None) -> tuple[list[BodyShape], str]:
     """Return the links of a robot as far as its shape and joints are known, with a sentence on their shape."""
     if q is None:
-        return [], f"{_NO_JOINTS}: only the flange is compared."
+        return [], f"{_NO_JOINTS}: only the flange's face is compared."
     if is_urdf(name):
         return urdf_shape(Path(name), q), ""
     if name not in known_arms():

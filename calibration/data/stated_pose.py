@@ -20,8 +20,10 @@ from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.results import RESULT_FILE as CALIBRATION_FILE
+from weldcal.calibration.data.results import pose_of_document
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
+from weldcal.models.documents import DocumentSection
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
@@ -209,6 +211,8 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
     covariance = tree.get("covariance", tree.get("covariance_X", tree.get("covariance_rotation_translation")))
     if isinstance(found, Mapping):
         covariance = found.get("covariance", covariance)
+        if "matrix" in found:
+            pose_of_document(DocumentSection.of(name, found, symbol), f"'{name}': {symbol}.matrix is no rigid pose.")
         found = found.get("matrix")
     if found is None:
         return None

@@ -93,7 +93,7 @@ def shown_steps(profiles: Sequence[Floats], heights_m: Floats) -> ShownSteps:
     if len(found) < MINIMUM_PROFILES:
         raise TooFewRotations(
             f"{len(found)} of {len(profiles)} profiles show the step. Take {MINIMUM_PROFILES} or more in which the"
-            " laser line crosses it, the flange tilted by 15 to 30 deg to all sides."
+            " laser line crosses it, the flange tilted by 15 to 30 deg to all sides, and check --height."
         )
     of = list(found.values())
     return ShownSteps(np.array(list(found)), np.array([f.gradient for f in of]), np.array([f.covariance for f in of]))
@@ -138,6 +138,12 @@ def step_sensor(rotation: Floats, profiles: Sequence[Floats], shown: ShownSteps)
         raise DegenerateMotion(
             f"The profiles leave the sensor's {name} open by {100.0 * sigma.max():.1f} %: their orientations differ by"
             f" {spread:.0f} deg. Tilt the flange by 15 to 30 deg about two axes between the profiles."
+        )
+    scales = fit.result.x[:2]
+    if np.abs(scales).min() > prior and scales[0] * scales[1] > 0.0:
+        raise InconsistentData(
+            f"Both scales are off by {100.0 * scales.mean():+.1f} %: the steps look like"
+            f" {100.0 / (1.0 + scales.mean()):.1f} % of --height. Measure the target, and give its height in mm."
         )
     correction = SensorCorrection(
         values=fit.result.x[:3], covariance=whole[:3, :3], field_m=np.array([every.min(axis=0), every.max(axis=0)])

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.stated_pose import HAND_EYE_FILE
 from weldcal.calibration.doctor.case import NAME, DoctorCase, case_of, dataset_case, read_case
 from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
@@ -62,6 +63,11 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
     if path.suffix == ".mcap":
         return worded("recording", _recorded(path, progress))
     folder = path if path.is_dir() else path.parent
+    if (path.is_file() and path.name != CALIBRATION) or (folder / HAND_EYE_FILE).is_file():
+        raise InputError(
+            f"'{path}' is nothing that the doctor reads: give a flange calibration's result, its dataset, or a"
+            " recording.mcap of a run. `weldcal verify` judges a hand-eye result."
+        )
     require_whole(folder)
     of_weld = _of_weld(folder)
     if (folder / NAME).is_file():

@@ -334,6 +334,8 @@ def _held(c: Cause) -> tuple[str, str]:
 
 
 def _scale(c: Cause) -> tuple[str, str]:
+    if "no hole circle is there" in c.words:
+        return c.words, "Check the scanner's own calibration: a ring without holes cannot confirm a scale."
     if c.words:
         return c.words, "Scan nearer, or with more pixels, so that three scans or more show the flange's holes."
     return (

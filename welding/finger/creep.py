@@ -15,6 +15,7 @@ FEWEST_ROWS = 40  # a choice: five for each of eight unknowns
 LEAST_PRESS_M = 0.5e-3  # a choice, as in calibrate_tip
 MOST_PRESS_M = 0.02  # a choice: no finger of this kind moves as far; more is another unit
 ALIKE_SPANS = 2.0  # a choice: largest ratio of indentation and deflection on a rigid plate
+SPARSE_S = 0.25  # a choice: at more between two rows, the friction's turn is not seen in a press of seconds
 SLOWEST_ROWS_S = 5.0  # a choice: between two rows of a table in s; more is another unit
 BACK = 0.5  # share of the largest indentation that the unloading must take back
 HELD = 1.5  # relaxation times that the table must last from the first press on
@@ -184,7 +185,11 @@ def _check(time_s: Array, indentation_m: Array, shown_m: Array | None) -> None:
         raise LoadingError(
             f"The rows are {np.median(np.diff(time_s)):g} s apart: t_s is in seconds, yours seem to be milliseconds."
         )
+    if float(np.median(np.diff(time_s))) > SPARSE_S:
+        raise LoadingError(f"The rows are {np.median(np.diff(time_s)):g} s apart: record ten rows a second or more.")
     press = float(np.ptp(indentation_m))
+    if -indentation_m.min() > 0.5 * press:
+        raise LoadingError("The indentation is negative: give it zero at contact and positive into the tip.")
     if not LEAST_PRESS_M <= press <= MOST_PRESS_M:
         raise LoadingError(
             f"The indentation spans {1e3 * press:g} mm: give indentation_mm in millimetres, pressed by"
