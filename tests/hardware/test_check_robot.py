@@ -544,7 +544,7 @@ def test_polyscope_x_is_checked_without_a_dashboard() -> None:
         assert report.ok, report.checks
         assert report.version is not None
         assert report.version[0] == 10
-        assert "not readable" in report.checks[CHECKS.index("remote control")].found
+        assert report.checks[CHECKS.index("remote control")].found == "on"
         new.fault("foreign_program")
         problem = preflight(new.host).first_problem
         assert problem is not None

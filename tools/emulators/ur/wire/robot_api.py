@@ -45,7 +45,8 @@ class _Request(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def __init__(self, data: bytes) -> None:
-        self.rfile, self.wfile = io.BytesIO(data), io.BytesIO()
+        self.written = io.BytesIO()
+        self.rfile, self.wfile = io.BytesIO(data), self.written
         self.client_address = ("", 0)
         self.raw_requestline = self.rfile.readline(65537)
         self.parsed = self.parse_request()
@@ -65,7 +66,7 @@ class _Request(BaseHTTPRequestHandler):
             self.send_header("Location", place)
         self.end_headers()
         self.wfile.write(body)
-        return self.wfile.getvalue()
+        return self.written.getvalue()
 
 
 class RobotApiServer(Server):
@@ -112,7 +113,7 @@ class RobotApiServer(Server):
             return
         connection.inbox.clear()
         if not request.parsed:  # what was wrong has been written already
-            self._send(connection, request.wfile.getvalue(), now)
+            self._send(connection, request.written.getvalue(), now)
             return
         self._answer(connection, request, now)
 
