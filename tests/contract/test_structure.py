@@ -16,7 +16,7 @@ BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
     "code lines of calibration": 30_270,
     "code lines of models": 6_337,
-    "code lines of systems": 19_398,
+    "code lines of systems": 19_402,
     "code lines of tools": 23_057,
     "code lines of welding": 9_680,
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments

@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 
 from tests.hardware.emulator_process import Emulator, emulator_process
-from weldcal.systems.drivers.ur.faults import SENTENCES, RobotUnreachable
-from weldcal.systems.drivers.ur.link import LinkState
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.systems.drivers.ur import link as link_module
+from weldcal.systems.drivers.ur.faults import SENTENCES, Fault, RobotUnreachable
+from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness import operator_actions
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire import robot_api
 from weldcal.systems.drivers.ur.wire.line import ask, stop_program
 from weldcal.systems.drivers.ur.wire.robot_api import RobotApiFailed, ask_robot_api, asker
@@ -108,11 +111,11 @@ def test_manual_mode_and_another_payload_are_named_with_their_menus() -> None:
 
 
 def test_no_action_and_no_fault_keeps_a_menu_of_polyscope_5() -> None:
-    texts = [v for k, v in vars(operator_actions).items() if k.isupper() and isinstance(v, str) and not k[0] == "_"]
+    texts = [v for k, v in vars(operator_actions).items() if k.isupper() and isinstance(v, str) and k[0] != "_"]
     texts += [operator_actions.power(mode) for mode in operator_actions.ROBOT_MODES]
     texts += [operator_actions.safety(mode) for mode in operator_actions.SAFETY_MODES]
     texts += [operator_actions.program("PAUSED", "x"), operator_actions.limits("elbow")]
-    for text in texts:
+    for text in [*texts, *SENTENCES.values()]:
         assert not [menu for menu in MENUS_OF_5 if menu in operator_actions.as_on_x(text)], text
     # each entry is in use: none is left over from a sentence that has changed
     everything = "".join(
@@ -122,9 +125,34 @@ def test_no_action_and_no_fault_keeps_a_menu_of_polyscope_5() -> None:
         assert five in everything, five
 
 
+def test_the_link_to_polyscope_x_names_its_menus_and_stops_by_its_robot_api(
+    robot: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped: list[Any] = []
+    monkeypatch.setattr(link_module, "stop_program", lambda host, asks: stopped.append(asks))
+    arm = load_arm()
+    link = UrLink.start(robot.host, arm, UrRtde(host=robot.host).limits(arm), version=X)
+    try:
+        robot.fault("protective_stop")
+        until = time.monotonic() + 10.0
+        while link.state().fault is Fault.NONE and time.monotonic() < until:
+            link.rest()
+            time.sleep(0.01)
+        fault = link.state().status.fault
+    finally:
+        link.close()
+    assert fault is not None
+    assert fault.startswith("PROTECTIVE STOP: ")
+    assert "unlock it on the pendant after 5 s" in fault
+    assert stopped
+    assert set(stopped) == {ask_robot_api}
+
+
 def test_a_fault_of_the_link_names_the_menus_of_polyscope_x() -> None:
     state = {"robot_mode": 7, "safety_mode": 3, "runtime_state": 4, "speed_scaling": 1.0, "arc": -1}
-    five, ten = (LinkState(fault=16, on_x=on_x, q=None, qd=None, **state).status.fault for on_x in (False, True))  # type: ignore[arg-type]
+    five, ten = (
+        LinkState(fault=Fault.POSE_MISMATCH, on_x=on_x, q=None, qd=None, **state).status.fault for on_x in (False, True)
+    )  # type: ignore[arg-type]
     assert five is not None
     assert ten is not None
     assert "Installation > General > TCP" in five
