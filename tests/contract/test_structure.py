@@ -16,8 +16,10 @@ BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
     "code lines of calibration": 30_297,
     "code lines of models": 6_337,
-    "code lines of systems": 19_197,
-    "code lines of tools": 22_831,
+    "code lines of calibration": 30_297,
+    "code lines of models": 6_337,
+    "code lines of systems": 19_402,
+    "code lines of tools": 23_065,
     "code lines of welding": 9_685,
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
-from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
+from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES, as_on_x
 from weldcal.systems.drivers.ur.robot import WorkerConfig
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
-from weldcal.systems.drivers.ur.wire.line import stop_program
+from weldcal.systems.drivers.ur.wire.line import ask, stop_program
 from weldcal.systems.drivers.ur.worker import WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
@@ -51,6 +51,7 @@ class LinkState(Published):
 
     age_s: float = 0.0  # since the robot took the sample
     fault: Fault = Fault.NONE
+    on_x: bool = False  # the controller has PolyScope X
 
     @property
     def program_running(self) -> bool:
@@ -61,7 +62,8 @@ class LinkState(Published):
     def codes(self) -> tuple[float, ...]:
         """The numbers that `status_of` reads."""
         running = float(self.program_running)
-        return float(self.robot_mode), float(self.safety_mode), running, self.speed_scaling, self.fault, self.detail
+        modes = float(self.robot_mode), float(self.safety_mode)
+        return *modes, running, self.speed_scaling, self.fault, self.detail, float(self.on_x)
 
     @property
     def status(self) -> UrStatus:
@@ -73,16 +75,18 @@ class LinkState(Published):
 def status_of(codes: tuple[float, ...]) -> UrStatus:
     """Return the controller's state in words.
 
-    The numbers are robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail.
+    The numbers are robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail, and whether the
+    controller has PolyScope X (0 or 1).
     """
-    robot_mode, safety_mode, running, scaling, code, detail = codes
+    robot_mode, safety_mode, running, scaling, code, detail, on_x = codes
     fault = Fault(int(code))
+    said = sentence(fault, detail) if fault is not Fault.NONE else ""
     return UrStatus(
         robot_mode=ROBOT_MODES.get(int(robot_mode), "UNKNOWN"),
         safety_mode=SAFETY_MODES.get(int(safety_mode), "UNKNOWN"),
         program_running=running > 0.5,
         speed_scaling=scaling,
-        fault=None if fault is Fault.NONE else sentence(fault, detail),
+        fault=(as_on_x(said) if on_x else said) or None,
     )
 
 
@@ -139,7 +143,8 @@ class UrLink:
                     fault = Fault(found.fault)
                     link._end()
                     kind = StartFailed if fault == Fault.START_FAILED else RobotRefused
-                    raise kind(sentence(fault, found.detail))
+                    said = sentence(fault, found.detail)
+                    raise kind(as_on_x(said) if link._on_x else said)
             if link._process.poll() is not None:
                 break
             time.sleep(0.01)
@@ -206,10 +211,14 @@ class UrLink:
         if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
             self._see_to_the_stop()
         judged = vars(found) | {"fault": fault, "fault_time": fault_time, "detail": detail}
-        return LinkState(**judged, age_s=now - found.host_time)
+        return LinkState(**judged, age_s=now - found.host_time, on_x=self._on_x)
+
+    @property
+    def _on_x(self) -> bool:
+        return self._config.version[:1] >= (10,)
 
     def close(self) -> None:
-        """Brake, end the program, end the worker, then confirm the stop through the dashboard. May be called twice."""
+        """Brake, end the program, end the worker, then confirm the stop at its operator's port. May be called twice."""
         if not self._finalizer.alive:
             return
         if self._process.poll() is None:
@@ -231,9 +240,11 @@ class UrLink:
             self._stopper.start()
 
     def _stop_program(self) -> None:
-        # without a dashboard (PolyScope X, or no network) the guard's watchdog has stopped the arm
+        from weldcal.systems.drivers.ur.wire.robot_api import asker  # only after a stop
+
+        # where nothing answers (no network) the guard's watchdog has stopped the arm
         with contextlib.suppress(RobotRefused):
-            stop_program(self._config.host)
+            stop_program(self._config.host, asks=asker(self._config.version) or ask)
 
     def _cause(self, ended: bool) -> Fault:
         """Return the fault of a worker that gives no state.

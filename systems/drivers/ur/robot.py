@@ -183,6 +183,7 @@ class WorkerConfig:
     gas_after_s: float = 0.0
     levels: tuple[Level, ...] = ()
     transport: str = NATIVE
+    version: tuple[int, ...] = ()
 
 
 class ControllerStream:

@@ -336,6 +336,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         upper_registers=report.upper_registers,
         payload_cog_m=(x, y, z),
         levels=levels,
+        version=report.version or (),
         **{name: getattr(config, name) for name in OF_WORKER},
     )
     link, why = start_link(start, config, transport, why)

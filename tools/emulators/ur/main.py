@@ -28,9 +28,11 @@ from weldcal.tools.emulators.ur.process import (
     CONTROL_PORT,
     DASHBOARD_PORT,
     DEFAULT,
+    HTTP_PORT,
     PRIMARY_PORT,
     READY,
     REAL_TIME_PORT,
+    ROBOT_API_PORT,
     RTDE_PORT,
     SECONDARY_PORT,
 )
@@ -38,6 +40,7 @@ from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, LoopWorld, Request
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
+from weldcal.tools.emulators.ur.wire.robot_api import RobotApiServer
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 from weldcal.tools.emulators.ur.wire.script_ports import ExternalControl, PrimaryServer, RealTimeServer
 
@@ -162,21 +165,28 @@ class Emulation:
         secondary = PrimaryServer(controller, heard, primary=False)
         real_time = RealTimeServer(controller, heard)
         external = ExternalControl(controller)
+        dashboard = DashboardServer(controller)
+        api = RobotApiServer(controller, dashboard)
         control = ControlServer(
             controller=controller,
             network=self._network,
             rtde=self._rtde,
+            api=api,
             external=external,
             checker=self._checker,
             lockstep=self._lockstep,
             world=self._world,
             more_faults=more_faults,
         )
-        self._servers = (self._rtde, self._primary, secondary, real_time, external)
+        self._servers = (self._rtde, self._primary, secondary, real_time, external, api)
         ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]
         ports += [(real_time, REAL_TIME_PORT), (control, control_port)]
         if controller.version.has_dashboard:
-            ports.append((DashboardServer(controller), DASHBOARD_PORT))
+            ports.append((dashboard, DASHBOARD_PORT))
+        if controller.version.has_robot_api:
+            ports.append((api, ROBOT_API_PORT))
+            with suppress(OSError):  # not every user may open it; clients of the controller's own makers expect it
+                self._network.listen(api, HTTP_PORT)
         for server, port in ports:
             try:
                 self._network.listen(server, port)

@@ -18,7 +18,8 @@ from weldcal.models.errors import InputError
 from weldcal.systems.interrupts import started
 
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
-PORTS = (DASHBOARD_PORT, PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT)
+ROBOT_API_PORT, HTTP_PORT = 30080, 80  # a controller's is 80, which few users may open
+PORTS = (DASHBOARD_PORT, PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, ROBOT_API_PORT)
 DEFAULT = "127.0.0.1"
 OWN = "127.29.{}.{}"  # where an emulator without an address looks for one
 TRIED = 64

@@ -28,6 +28,11 @@ class Version:
         return self.major < 10
 
     @property
+    def has_robot_api(self) -> bool:
+        """PolyScope X from 10.11 on has an HTTP server in the dashboard's place."""
+        return self.at_least((99, 0), (10, 11))
+
+    @property
     def takes_scripts(self) -> bool:
         """Whether the script ports run programs [M]: before 10.10 ur_rtde does not try, and there is no remote mode."""
         return self.at_least((0, 0), (10, 10))

@@ -67,7 +67,7 @@ def payload_finding(seen: Mapping[str, Value], expected: ExpectedLoad | None) ->
 
 
 def mode_finding(answer: str) -> Finding:
-    """What the dashboard's answer to `get operational mode` means.
+    """What the answer of dashboard or Robot API to `get operational mode` means.
 
     An answer that is no mode is shown and not judged.
     """

@@ -1,4 +1,7 @@
-"""Operator actions, one sentence for each condition that prevents a start, with the menu names of PolyScope 5."""
+"""Operator actions, one sentence for each condition that prevents a start, in the menu names of PolyScope 5.
+
+`as_on_x` puts those of PolyScope X in their place.
+"""
 
 ROBOT_MODES = {
     -1: "NO_CONTROLLER",
@@ -153,3 +156,56 @@ def program(state: str, name: str) -> str:
         f"The robot is busy with {which} ({state}): press Stop at the bottom of the pendant's screen; weldcal "
         "does not stop other programs."
     )
+
+
+# PolyScope 5's menus, and PolyScope X's: https://www.universal-robots.com/manuals SW10_12 (safety overview, mode
+# selection), and the pictures and files of UR's client library (Robot State, Speed, Application, Services). The first
+# that fit are taken first.
+X_MENUS = (
+    (
+        "tap the Local icon at the upper right of the pendant and choose Remote Control (where there is none, enable it"
+        " first under Settings > System > Remote Control)",
+        "tap the safety overview at the upper right of the pendant, then Mode Selection > Automatic > Remote",
+    ),
+    (
+        "tap the mode at the upper right of the pendant and choose Automatic",
+        "tap the safety overview at the upper right of the pendant, then Mode Selection > Automatic",
+    ),
+    ("switch it to Remote Control (top right of the pendant)", "choose Remote in the pendant's safety overview"),
+    (_ON_START, "tap Robot State at the lower left of the pendant, switch the arm on and release its brakes"),
+    (f"{_INITIALIZE}, then START", "tap Robot State at the lower left of the pendant and release them"),
+    ("the Initialize screen, then press START there", "the Robot State panel, then release the brakes there"),
+    ("Installation > General > TCP", "Application > End Effector"),
+    ("Installation > General > Payload", "Application > End Effector"),
+    ("Installation > General > Mounting", "Application > Mounting"),
+    ("save the installation", "save the program"),
+    ("of the default TCP", "of the active TCP"),
+    (
+        "press Disable under Installation > Fieldbus > EtherNet/IP and > PROFINET on the pendant",
+        "switch Ethernet/IP Adapter and Profinet Device off under Settings > Security > Services on the pendant",
+    ),
+    (
+        "drag the slider at the bottom of the pendant's screen all the way to the right",
+        "press + beside Speed at the lower right of the pendant's screen until it shows 100 %",
+    ),
+    ("The speed slider", "Speed"),
+    ("press Enable Robot in the pop-up on the pendant", "unlock it in the message on the pendant"),
+    ("press Enable Robot on the pendant", "unlock it on the pendant"),
+    ("move the speed slider to 100 % on the pendant", "set Speed at the lower right of the pendant to 100 %"),
+    ("check payload, speed slider", "check payload, speed"),
+    ("an action in Installation > I/O", "an action of an output in Application"),
+    ("read the Log tab of the pendant", "read the message on the pendant"),
+    ("press Restart Safety in the pop-up", "restart the safety system there"),
+    ("Move tab's arrows", "Move panel's arrows"),
+    ("the Move tab", "the Move panel"),
+    ("The dashboard's answer does not follow the PolyScope 5 protocol", "The Robot API's answer is not known"),
+    ("update PolyScope to 5.12 or newer", "update PolyScope X to 10.12 or newer"),
+    ("see its Log tab for an error", "see its log for an error"),
+)
+
+
+def as_on_x(action: str) -> str:
+    """Return an operator action with the menus of PolyScope X in place of PolyScope 5's."""
+    for five, ten in X_MENUS:
+        action = action.replace(five, ten)
+    return action

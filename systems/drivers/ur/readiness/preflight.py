@@ -1,7 +1,7 @@
 """Checks before the first motion whether a robot is ready, in the order in which an operator corrects the failures.
 
 Nothing moves, nothing is written, nothing is uploaded: outputs are read, and input registers are claimed and released.
-The operator actions use the menu names of PolyScope 5.
+The operator actions use the menu names of the controller's PolyScope, 5 or X.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ from weldcal.systems.drivers.ur.readiness.load import (
     mounting_finding,
     payload_finding,
 )
-from weldcal.systems.drivers.ur.wire.line import ask
+from weldcal.systems.drivers.ur.wire.robot_api import asker
 from weldcal.systems.drivers.ur.wire.rtde_client import (
     DOUBLES,
     IN_USE,
@@ -265,10 +265,13 @@ class _Look:
         self._done[name] = Check(name, True, found)
 
     def _bad(self, name: str, found: str, action: str) -> None:
-        self._done[name] = Check(name, False, found, action)
+        self._done[name] = Check(name, False, found, actions.as_on_x(action) if self._is_x() else action)
 
     def _state(self, name: str, ok: bool, found: str, action: str) -> None:
-        self._done[name] = Check(name, ok, found, "" if ok else action)
+        if ok:
+            self._ok(name, found)
+        else:
+            self._bad(name, found, action)
 
     def _number(self, name: str) -> float:
         return float(cast(float, self._seen[name]))
@@ -279,6 +282,11 @@ class _Look:
     @property
     def _version_text(self) -> str:
         return "PolyScope " + ".".join(str(number) for number in (self._found.version or ())[:3])
+
+    @property
+    def _readable(self) -> bool:
+        """The dashboard, or the Robot API of PolyScope X from 10.12 on, can be asked."""
+        return asker(self._found.version or ()) is not None
 
     def _is_x(self) -> bool:
         return self._found.version is not None and self._found.version[0] >= POLYSCOPE_X
@@ -303,17 +311,17 @@ class _Look:
         state = int(self._number("runtime_state"))
         found = actions.RUNTIME_STATES.get(state, f"state {state}")
         name = ""
-        if not self._is_x():
+        if self._readable:
             try:
                 told, _, name = self._ask("programState").partition(" ")
             except RobotUnreachable as problem:
                 self._dashboard = False
-                self._bad("program", f"{found}; the dashboard does not answer", str(problem))
+                self._bad("program", f"{found}; {self._service} does not answer", str(problem))
                 return
             if told in ("PLAYING", "PAUSED", "STOPPED"):
                 found = told if state == STOPPED else found
             elif told != LOCAL:
-                self._bad("program", f"the dashboard says {told} {name}".strip(), actions.DASHBOARD)
+                self._bad("program", f"{self._service} says {told} {name}".strip(), actions.DASHBOARD)
                 return
         ready = found == "STOPPED"
         self._state("program", ready, "none runs" if ready else f"{found} {name}".strip(), actions.program(found, name))
@@ -362,7 +370,8 @@ class _Look:
         """Check that the controller's arm is the scenario's, as far as their names differ."""
         wanted = self._nominal.name
         if self._is_x():
-            self._ok("model", "not readable on PolyScope X; the kinematics tell")
+            readable = "PolyScope X names none" if self._readable else "not readable on PolyScope X"
+            self._ok("model", f"{readable}; the kinematics tell")
             return
         try:
             told = self._ask("get robot model")
@@ -395,11 +404,12 @@ class _Look:
         self._state("flange pose", agrees, found, actions.POSE)
 
     def _check_remote(self) -> None:
-        if self._is_x():
-            self._ok("operational mode", "not readable on PolyScope X; look at the pendant")
-            # PolyScope X has no dashboard; in local control it ignores scripts, and the driver refuses a guard script
-            # that does not start
-            self._ok("remote control", "not readable on PolyScope X; checked when the guard script starts")
+        if not self._readable:
+            old = "not readable before PolyScope X 10.12"
+            self._ok("operational mode", f"{old}; look at the pendant")
+            # it has neither dashboard nor Robot API; in local control it ignores scripts, and the driver refuses a
+            # guard script that does not start
+            self._ok("remote control", f"{old}; checked when the guard script starts")
             return
         if not self._dashboard:
             return
@@ -407,17 +417,27 @@ class _Look:
             told, mode = self._ask("is in remote control"), self._ask("get operational mode")
         except RobotUnreachable as problem:
             for name in ("operational mode", "remote control"):
-                self._bad(name, "the dashboard does not answer", str(problem))
+                self._bad(name, f"{self._service} does not answer", str(problem))
             return
         self._state("operational mode", *mode_finding(mode))
         if told not in ("true", "false", LOCAL):
-            self._bad("remote control", f"the dashboard says {told}", actions.DASHBOARD)
+            self._bad("remote control", f"{self._service} says {told}", actions.DASHBOARD)
             return
         self._state("remote control", told == "true", "on" if told == "true" else "local control", actions.LOCAL)
 
+    @property
+    def _service(self) -> str:
+        return "the Robot API" if self._is_x() else "the dashboard"
+
     def _ask(self, command: str) -> str:
-        """Return the dashboard's answer; LOCAL where it refuses because the robot is in local control."""
-        answer = ask(self._found.host, command, self._timeout_s)
+        """Return the dashboard's or Robot API's answer; LOCAL where it refuses because the robot is in local control.
+
+        Raises:
+            RobotUnreachable: it does not answer in time.
+        """
+        asks = asker(self._found.version or ())
+        assert asks is not None
+        answer = asks(self._found.host, command, self._timeout_s)
         return LOCAL if "remote control mode" in answer.lower() else answer
 
     def _vector(self, name: str) -> Array:

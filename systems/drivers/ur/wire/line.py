@@ -6,6 +6,7 @@ import contextlib
 import socket
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 
 from weldcal.systems.addresses import controller_address
@@ -14,6 +15,7 @@ from weldcal.systems.drivers.ur.faults import RobotUnreachable
 RELEASE_WAIT_S = 0.3  # a choice: a controller closes in some frames; one that does not delays every command by this
 DASHBOARD_PORT = 29999
 SCRIPT_PORT = 30003
+Ask = Callable[[str, str, float], str]  # host, command of the dashboard, longest time (s): the answer
 
 
 class SocketLine:
@@ -27,7 +29,7 @@ class SocketLine:
         host = controller_address(host)
         self._host, self._port, self._service, self._timeout_s = host, port, service, timeout_s
         self._inbox = bytearray()
-        address = _resolve(host, port, timeout_s)
+        address = resolve(host, port, timeout_s)
         try:
             self._socket = socket.create_connection(address, timeout=timeout_s)
         except ConnectionRefusedError as error:
@@ -128,8 +130,12 @@ class SocketLine:
         self._socket.close()
 
 
-def _resolve(host: str, port: int, timeout_s: float) -> tuple[str, int]:
-    """Resolve the address of a host in a thread, because the system's look-up has no time limit."""
+def resolve(host: str, port: int, timeout_s: float) -> tuple[str, int]:
+    """Resolve the address of a host in a thread, because the system's look-up has no time limit.
+
+    Raises:
+        RobotUnreachable: no host has this name.
+    """
     found: list[tuple[str, int]] = []
 
     def look_up() -> None:
@@ -168,17 +174,18 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
         return line.read_line(until)
 
 
-def stop_program(host: str, timeout_s: float = 2.0) -> str:
+def stop_program(host: str, timeout_s: float = 2.0, asks: Ask = ask) -> str:
     """Stop the running or paused program; returns "Stopped", the controller's refusal, or an empty text.
 
-    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where
-    there is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
+    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. `asks` is
+    the dashboard, or the Robot API of PolyScope X. Where it does not answer, the command goes to the script port, which
+    does not answer either.
 
     Raises:
         RobotUnreachable: neither port answers in time.
     """
     try:
-        return ask(host, "stop", timeout_s)
+        return asks(host, "stop", timeout_s)
     except RobotUnreachable:
         with SocketLine(host, SCRIPT_PORT, "Script", timeout_s) as line:
             line.send(b"stop program\n")

@@ -16,6 +16,7 @@ from weldcal.tools.emulators.ur.controller.registers import RobotMode, SafetyMod
 from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
+from weldcal.tools.emulators.ur.wire.robot_api import RobotApiServer
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 from weldcal.tools.emulators.ur.wire.script_ports import CLIENT_PORT, ExternalControl
 
@@ -44,6 +45,7 @@ class ControlServer(Server):
         controller: Controller,
         network: Network,
         rtde: RtdeServer,
+        api: RobotApiServer,
         external: ExternalControl,
         checker: Checker,
         lockstep: Lockstep,
@@ -52,6 +54,7 @@ class ControlServer(Server):
     ) -> None:
         self._controller, self._network, self._external = controller, network, external
         self._rtde, self._checker, self._lockstep, self._world = rtde, checker, lockstep, world
+        self._api = api
         c = controller
         self._faults: dict[str, Callable[[Request, float], None]] = {
             "drop": lambda r, now: self._each(r, drop_until=now + _number(r, "seconds")),
@@ -93,6 +96,7 @@ class ControlServer(Server):
             "wrong_tcp": lambda r, now: c.set_tcp(_several(r, "pose", 6, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
             "set_q": lambda r, now: c.arm.displace(np.array(_several(r, "q", 6))),
             "wrong_number": self._wrong_number,
+            "robot_api": lambda r, now: self._robot_api(str(r.get("what"))),
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
         self._faults |= more_faults or {}
@@ -213,6 +217,7 @@ class ControlServer(Server):
     def _clear_links(self, request: Request, now: float) -> None:
         self._world.jitter_s = 0.0
         self._rtde.wrong.clear()
+        self._robot_api("")
         for connection in self._links({"kind": "all"} | dict(request)):
             connection.faults = LinkFaults()
 
@@ -290,6 +295,14 @@ class ControlServer(Server):
         if name not in self._rtde.real_outputs():
             raise InputError(f"There is no output of real numbers {name!r}.")
         self._rtde.wrong[name] = float(request.get("value", math.nan))  # not finite: that is the fault
+
+    def _robot_api(self, what: str) -> None:
+        """One of the faults of the Robot API, or `refused`; "" ends it."""
+        self._api.inject("" if what == "refused" else what)
+        if what == "refused":
+            self._network.unplug(*(server for server in self._network.listening() if server is not self._api))
+        elif self._world.unplugged_until is None:
+            self._network.plug()
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)

@@ -214,6 +214,10 @@ class Network:
             if server not in kept:
                 connection.close(reset=True)
 
+    def listening(self) -> list[Server]:
+        """The servers that listen."""
+        return [server for server, _ in self._listeners.values()]
+
     def plug(self) -> None:
         """Listens again where `unplug` stopped."""
         ports, self._ports = self._ports, []
