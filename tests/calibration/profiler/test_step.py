@@ -120,6 +120,11 @@ def test_a_profile_of_something_else_is_named_and_does_not_change_the_answer() -
     [
         (lambda s: replace(s, heights_m=1e3 * s.heights_m), InputError, "does not fit into profiles of .* mm"),
         (lambda s: replace(s, heights_m=4.0 * s.heights_m), InputError, "does not fit|shows the step"),
+        (
+            lambda s: replace(s, heights_m=1.05 * s.heights_m),
+            InconsistentData,
+            "the steps look like 9[45].. % of --height",
+        ),
         (lambda s: replace(s, heights_m=0.5 * s.heights_m), FeatureNotFound, "no two parallel faces 5 mm apart"),
         (lambda s: replace(s, poses=s.poses[:4], profiles=s.profiles[:4]), TooFewRotations, "4 of 4 profiles show"),
         (

@@ -129,6 +129,8 @@ def plain() -> np.ndarray:
         (lambda t, u, f: (t, 1e-3 * u, f), "spans 0.003 mm: give indentation_mm in millimetres"),
         (lambda t, u, f: (t, 1e3 * u, f), "spans 3000 mm: give indentation_mm in millimetres"),
         (lambda t, u, f: (t, u, 0.0 * f + 1.0), "the same in all rows"),
+        (lambda t, u, f: (30.0 * t, u, f), "The rows are 0.9.* s apart: record ten rows a second"),
+        (lambda t, u, f: (t, -u, f), "The indentation is negative: give it zero at contact"),
     ],
 )
 def test_a_table_that_shows_nothing_is_refused_with_what_to_do(plain: np.ndarray, wrong: object, sentence: str) -> None:
