@@ -120,8 +120,8 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
     reached = X_BF if q is None else chain_forward(load_chain(name, kinematics), q)
     if (off := float(np.linalg.norm(reached.translation() - X_BF.translation()))) > _SAME_M:
         raise InputError(
-            f"The joint angles of scan '{id}' put the flange of '{Path(name).name}' {1e3 * off:.0f} mm from its recorded pose:"
-            " give them in rad, and name the arm that was moved by --robot."
+            f"The joint angles of scan '{id}' put the flange of '{Path(name).name}' {1e3 * off:.0f} mm from its"
+            " recorded pose: give them in rad, and name the arm that was moved by --robot."
         )
     bodies, note = _links(name, q, kinematics)
     if kinematics is not None:

@@ -200,7 +200,7 @@ def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], dict[str,
         if (lists := at_rest(*recorded)) is None:
             raise DatasetError(
                 f"'{path.name}' has fewer than {FEWEST_RESTS} poses at which the arm rested and the camera saw the"
-                " board: let the arm rest for a second at each pose, and record again. (`hand-eye` also reads a motion.)"
+                " board: let it rest for a second at each pose, and record again. (`hand-eye` also reads a motion.)"
             )
         return lists, {}
     if path.is_dir():
