@@ -120,7 +120,7 @@ def plain(square: Array, rank: float) -> Array:
 
 
 def helmert(left: Remainder) -> float:
-    """Weighted squares over the spare numbers (Helmert's simplified estimator), a factor of ten at most."""
+    """Weighted squares over the spare numbers (Helmert's simplified estimator); a variance falls to a tenth at most."""
     return left.sigma * float(np.sqrt(np.clip(left.weighted / left.spare, 0.1, 100.0)))
 
 

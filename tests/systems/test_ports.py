@@ -33,8 +33,10 @@ from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
+from weldcal.models.tools.elastomers import MATERIALS
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background import BackgroundSystem
+from weldcal.systems.bodies.relaxing_tip import RelaxingTip
 from weldcal.systems.drivers.power.modbus import ModbusPowerSourcePorts, PowerLink
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
 from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
@@ -184,6 +186,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
     UrTouchProbeInput: lambda: UrTouchProbeInput(cast("ProbeInput", SimpleNamespace(touches=Touches()))),
     SimulatedArc: lambda: SimulatedArc(SimulatedPowerSource()),
+    RelaxingTip: lambda: RelaxingTip(MATERIALS["tpu_95a"], 0.002),
     ModbusPowerSourcePorts: lambda: ModbusPowerSourcePorts(
         cast("PowerLink", SimpleNamespace(shown={"arc_established": 0.0}, command=lambda on, values: None))
     ),
@@ -361,6 +364,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "newest_capture": 2,
     },
     UrTouchProbeInput: {"touch": TorchTouch},
+    RelaxingTip: {"tip_state": 6, "desired_state": 6},
     SimulatedArc: {"process_on": 1, "set_values": 4, "arc_established": 1, "arc_values": 2},
     ModbusPowerSourcePorts: {"process_on": 1, "set_values": 4, "arc_established": 1, "arc_values": 2},
     ArcSchedule: {
