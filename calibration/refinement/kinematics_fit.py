@@ -27,10 +27,7 @@ _LEAST_ORDER = 2  # the arm's errors must not stand in for bends that a plain ca
 _PARTS = ("turn x", "turn y", "offset", "shift x", "shift y", "shift z")
 
 _POSITION_M, _NORMAL_RAD = 1e-4, 1e-3  # what arms and scanners leave of a scan
-_POSE_SIGMA, _FACTOR_SIGMA = (
-    10.0,
-    0.1,
-)  # of X_BC (rad, m) and the scanner's factors before any scan: next to nothing is known
+_BEFORE = 0.1  # of X_BC (rad, m) and the scanner's factors before any scan: next to nothing is known
 
 
 @dataclass(frozen=True)
@@ -392,15 +389,15 @@ def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: 
     wanted = np.einsum("nij,nik->jk", J[:, :3], J[:, :3])
     J = J / np.repeat([_POSITION_M, _NORMAL_RAD], 3)[:, None]
     terms = J.shape[2] - 6 - k
-    V = np.diag(np.concatenate([np.full(6, _POSE_SIGMA**2), np.full(terms, _FACTOR_SIGMA**2), np.ones(k)]))
-    chosen: list[int] = []
+    sigma = np.concatenate([np.full(6 + terms, _BEFORE), np.ones(k)])
+    J, wanted = J * sigma, wanted * np.outer(sigma, sigma)  # unit priors; a covariance that is taken down loses digits
+    A, chosen = np.eye(len(sigma)), list[int]()
     for _ in range(min(n, len(q))):
-        JV = J @ V
+        JV = np.linalg.solve(A, J.reshape(-1, len(A)).T).T.reshape(J.shape)
         own = np.linalg.inv(np.eye(6) + JV @ np.swapaxes(J, 1, 2))
         gain = np.einsum("nij,nji->n", own, JV @ wanted @ np.swapaxes(JV, 1, 2))
         gain[chosen] = -np.inf
         best = int(np.argmax(gain))
         chosen.append(best)
-        V = V - JV[best].T @ own[best] @ JV[best]
-        V = 0.5 * (V + V.T)
+        A = A + J[best].T @ J[best]
     return np.array(chosen)
