@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.linalg import block_diag
 
-from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, plain
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, most_informative, plain
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
@@ -391,13 +391,8 @@ def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: 
     terms = J.shape[2] - 6 - k
     sigma = np.concatenate([np.full(6 + terms, _BEFORE), np.ones(k)])
     J, wanted = J * sigma, wanted * np.outer(sigma, sigma)  # unit priors; a covariance that is taken down loses digits
-    A, chosen = np.eye(len(sigma)), list[int]()
-    for _ in range(min(n, len(q))):
-        JV = np.linalg.solve(A, J.reshape(-1, len(A)).T).T.reshape(J.shape)
-        own = np.linalg.inv(np.eye(6) + JV @ np.swapaxes(J, 1, 2))
-        gain = np.einsum("nij,nji->n", own, JV @ wanted @ np.swapaxes(JV, 1, 2))
-        gain[chosen] = -np.inf
-        best = int(np.argmax(gain))
-        chosen.append(best)
-        A = A + J[best].T @ J[best]
-    return np.array(chosen)
+
+    def known(information: Array) -> Array:
+        return -np.asarray(np.trace(np.linalg.solve(information, wanted), axis1=-2, axis2=-1))
+
+    return np.array(most_informative(np.eye(len(sigma)), np.swapaxes(J, 1, 2) @ J, min(n, len(q)), known)[0])
