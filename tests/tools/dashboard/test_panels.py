@@ -222,8 +222,8 @@ def organised(rows: int = 120, columns: int = 160) -> Scan:
 
 def test_the_picture_of_a_scan_has_a_ring_where_the_flange_was_found() -> None:
     scan = organised()
-    plain = depth_picture(scan, None).astype(int)
-    ringed = depth_picture(scan, FlangeEstimate(sequence=3, capture_time=0.0, fit=FIT)).astype(int)
+    plain = depth_picture(scan.points_C, None).astype(int)
+    ringed = depth_picture(scan.points_C, FIT).astype(int)
     assert plain[:30, :30].max() < 60, "nothing was seen there"
     changed = np.argwhere(np.abs(ringed - plain).max(axis=2) > 40)
     scale = plain.shape[1] / 160
