@@ -123,7 +123,7 @@ def webcam(text: str) -> DriverSensor:
     if not good:
         raise InputError(f"The camera '{text}' cannot be opened: look at its cable, and close programs that use it.")
     height, width = picture.shape[:2]
-    return DriverSensor(VideoFingerCamera(source=text, width=width, height=height).source(), f"camera {text}")
+    return DriverSensor(VideoFingerCamera(source=text, width=width, height=height).open_source(), f"camera {text}")
 
 
 def _written(datum: Any, folder: Path) -> Path:
