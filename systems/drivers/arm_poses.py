@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.capture import ArmPose
+from weldcal.calibration.capture.session import ArmPose
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import read_text

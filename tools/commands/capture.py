@@ -9,12 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from weldcal.calibration.capture import BoardTask, FlangeTask, Session, Task
+from weldcal.calibration.capture.session import Session, Task
+from weldcal.calibration.capture.tasks import BoardTask, FlangeTask
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.arm_poses import KINDS, ArmSource, arm_source
 from weldcal.tools import console
-from weldcal.tools.cli.options import Call, command, option, switch
+from weldcal.tools.cli.options import LOOK, Call, command, option, switch
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
 from weldcal.tools.dashboard.capture_run import CaptureRun, DriverSensor, FolderSensor, Sensor
 from weldcal.tools.dashboard.capture_run import webcam as opened_webcam
@@ -22,7 +23,12 @@ from weldcal.tools.dashboard.capture_run import webcam as opened_webcam
 PERIOD_S = 0.5
 
 
-@command("capture", short_help="Capture by hand: each scan or picture is judged at once.")
+@command(
+    "capture",
+    options=("browser", "seed"),
+    common=LOOK,
+    short_help="Capture by hand: each scan or picture is judged at once.",
+)
 def capture(
     call: Call,
     scenario: Annotated[
@@ -45,23 +51,22 @@ def capture(
     demo: Annotated[
         bool, switch("--demo", "With an emulated arm and scanner; the page's buttons jog the arm.")
     ] = False,
-    browser: Annotated[bool, switch("--browser/--no-browser", "Open the page.")] = True,
+    out: Annotated[Path, option("--out", "FOLDER", "Of the session; one that is there goes on.")] = Path("capture"),
 ) -> dict[str, object]:
     """Take scans of the flange, or pictures of a board, by hand; the page judges each and proposes the next pose.
 
-    Nothing is sent to the robot. All captures are in the result folder, which `weldcal calibrate` or `weldcal hand-eye`
-    reads; the same folder (--out) goes on where it ended. Ctrl+C ends it.
+    Nothing is sent to the robot. All captures are in the folder of --out, which `weldcal calibrate` or `weldcal
+    hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
     """
     cell = DemoCell(call.seed) if demo else None
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
     task: Task = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
-    folder = call.out or Path("capture")
-    run = CaptureRun(Session(folder, task), arm, sensor, required_mm, "weldcal capture")
+    run = CaptureRun(Session(out, task), arm, sensor, required_mm, "weldcal capture")
     with closing(run):
-        _serve(run, browser)
-    return {"state": "done", "folder": str(folder), "captures": len(run.session.captures), "next": task.command(folder)}
+        _serve(run, call.live["browser"])
+    return {"state": "done", "folder": str(out), "captures": len(run.session.captures), "next": task.command(out)}
 
 
 def _serve(run: CaptureRun, browser: bool) -> None:
@@ -84,7 +89,9 @@ def _serve(run: CaptureRun, browser: bool) -> None:
 
 
 def _flange_of(robot: str) -> str:
-    return get_robot(robot).flange if robot else ""
+    if not robot:
+        raise InputError("Name the arm with --robot, such as ur10e, or its flange with --flange.")
+    return get_robot(robot).flange
 
 
 def _sensor(scenario: str | None, watch: Path | None, webcam: str | None) -> Sensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.calibration.capture import ArmPose
+from weldcal.calibration.capture.session import ArmPose
 from weldcal.calibration.data.clouds import save_cloud
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm

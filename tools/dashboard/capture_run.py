@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.capture import ArmPose, Capture, Session, Verdict, ur_pose
+from weldcal.calibration.capture.session import ArmPose, Capture, Session, Verdict, ur_pose
 from weldcal.calibration.data.clouds import SUFFIXES, CloudError, read_cloud, save_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey

@@ -19,6 +19,7 @@ POINTS = 20_000
 """Points that are drawn of each scan."""
 _AXIS_M = 0.08
 _COLOURS = ((1.0, 0.0, 0.0), (0.0, 0.6, 0.0), (0.0, 0.3, 1.0))
+_FROM_M = np.array([0.9, -0.9, 0.7])  # from where the camera looks at the first pose
 _GHOST = Rgba(0.45, 0.25, 0.75, 0.9)
 
 
@@ -29,6 +30,7 @@ class CaptureView:
         self._meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
         self.url = self._meshcat.web_url()
         self._drawn: set[str] = set()
+        self._looks = False
 
     def show(self, run: CaptureRun) -> None:
         """Draw the session as it is."""
@@ -45,6 +47,10 @@ class CaptureView:
                     self._cloud(f"taken/{id}/scan", verdict.X, read_cloud(one.file), one.found, id in odd)
         if verdict.X is not None and verdict.symbol == "X_BC":
             self._triad("scanner", verdict.X, 1.5)
+        seen = [one.pose.X_BF.translation() for one in taken.values() if one.pose.X_BF is not None]
+        if seen and not self._looks:  # afterwards the camera is the user's
+            self._meshcat.SetCameraPose(seen[0] + _FROM_M, seen[0])
+            self._looks = True
         self._meshcat.Delete("next")
         if verdict.advice is not None and verdict.advice.X_BF is not None:
             self._triad("next", verdict.advice.X_BF, 1.5, _GHOST)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from tests.browser import Browser
-from weldcal.calibration.capture import FlangeTask, Session
+from weldcal.calibration.capture.session import Session
+from weldcal.calibration.capture.tasks import FlangeTask
 from weldcal.calibration.recorded_flange import calibrate_flange
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
 from weldcal.tools.dashboard.capture_run import READY, CaptureRun
@@ -48,7 +49,7 @@ def test_a_person_reaches_a_calibration_by_the_page_alone(run: CaptureRun, brows
             browser.run("document.body.dispatchEvent(new KeyboardEvent('keydown', {code: 'Space', bubbles: true}))")
             until(lambda k=k: len(run.session.captures) == k + 1 and run.state == READY)  # type: ignore[misc]
             view.show(run)
-            name = "to the next pose" if move == "next" else move.replace("r", "turn ")
+            name = "to the next pose" if move == "next" else f"turn {move.replace('r', '')}" if "r" in move else move
             browser.run(f"[...document.querySelectorAll('#jogs button')].find(b => b.textContent === '{name}').click()")
             before = cell.pose()
             until(lambda before=before: max(cell.pose().moved(before)) >= 0.0)  # type: ignore[misc]

@@ -21,7 +21,7 @@ function shown(v) {
   const busy = v.state !== "READY", one = v.last;
   document.body.dataset.state = v.state === "READY" ? "DONE" : "RUNNING";
   say("title", v.title);
-  say("arm", v.arm + ", " + v.sensor);
+  say("arm", v.arm === v.sensor ? v.arm : v.arm + ", " + v.sensor);
   say("state", v.state);
   const bad = v.problem || (one && one.refused) || "";
   el("line").className = bad ? "bad" : "";
@@ -50,7 +50,7 @@ function shown(v) {
   if (v.jogs && !el("jogs").children.length) {
     for (const name of ["+x", "-x", "+y", "-y", "+z", "-z", "+rx", "-rx", "+ry", "-ry", "+rz", "-rz"]) {
       const b = document.createElement("button");
-      b.type = "button"; b.textContent = name.replace("r", "turn "); b.addEventListener("click", () => ask("jog-" + name));
+      b.type = "button"; b.textContent = name.includes("r") ? "turn " + name.replace("r", "") : name; b.addEventListener("click", () => ask("jog-" + name));
       el("jogs").append(b);
     }
     const go = document.createElement("button");
