@@ -77,7 +77,7 @@ class ArmPose:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
-    """One scan or picture with its pose. ``found``: what was found in it, to be drawn; ``refused``: why it is not kept."""
+    """One scan or picture with its pose. ``found``: what was found in it, to be drawn; ``refused``: why it is left out."""
 
     id: str
     file: Path
@@ -131,7 +131,7 @@ class Task(Protocol):
         """Drop what was found in a capture."""
 
     def fresh(self) -> Task:
-        """Return the same task, which has seen nothing."""
+        """Return the same task, with nothing found yet."""
 
     def solve(self, folder: Path, last: ArmPose) -> Verdict:
         """Calibrate. Raises WeldcalError as the command of this folder does."""
@@ -254,7 +254,7 @@ class Session:
 
 
 def jog(now: ArmPose, goal: RigidTransform) -> str:
-    """Say how a person moves the flange from a pose to another: shifts along, then turns about the base's axes."""
+    """Return in words how to jog the flange to a pose: shifts along the base's axes, then turns about them."""
     if now.X_BF is None:
         p, w = 1e3 * goal.translation(), log_rotation(goal.rotation().matrix()[None])[0]
         at, turn = ", ".join(f"{v:.0f}" for v in p), ", ".join(f"{v:.3f}" for v in w)

@@ -89,11 +89,11 @@ class FlangeTask:
         if a is None or b is None or not isinstance(one.found, FlangeFit) or not isinstance(other.found, FlangeFit):
             return ""
         robot = float(np.linalg.norm(a.translation() - b.translation()))
-        seen = float(np.linalg.norm(one.found.center_C - other.found.center_C))
-        if abs(robot - seen) < _APART_M + _APART * max(robot, seen):
+        shown = float(np.linalg.norm(one.found.center_C - other.found.center_C))
+        if abs(robot - shown) < _APART_M + _APART * max(robot, shown):
             return ""
         return (
-            f"Since {one.id} the flange moved by {1e3 * robot:.0f} mm at the robot and by {1e3 * seen:.0f} mm in the"
+            f"Since {one.id} the flange moved by {1e3 * robot:.0f} mm at the robot and by {1e3 * shown:.0f} mm in the"
             " scans: the pose or the scan is an older one, the pose is not in its unit, or it is not the flange's (a TCP"
             " is set at the robot)."
         )

@@ -100,7 +100,7 @@ def _of_matrix(M: np.ndarray) -> RigidTransform:
 
 
 class TypedPose:
-    """The numbers that a person typed last."""
+    """The numbers that were typed last."""
 
     words = "typed into the page"
 

@@ -1,4 +1,4 @@
-"""weldcal capture: take scans or pictures at a robot that a person jogs, with a page that judges each of them at once."""
+"""weldcal capture: scans or pictures at a robot that is jogged by hand, with a page that judges each of them at once."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class DemoCell:
             raise InputError("There is no next pose yet: take three captures first.")
         q = nearest_solution(self._arm, goal, self._q)
         if q is None:
-            raise InputError("The arm does not reach that pose: jog another way.")
+            raise InputError("The arm does not reach that pose: jog elsewhere.")
         self._q = q
 
     def take(self, folder: Path) -> Path:
