@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
 
-from weldcal.models.arms.chain import Chain, is_urdf, load_chain
+from weldcal.models.arms.chain import is_urdf, load_chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange

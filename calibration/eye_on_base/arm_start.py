@@ -20,9 +20,9 @@ from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, frames_along, pose
-from weldcal.models.arms.chain import Chain, chain_capsules, known_chains, load_chain
+from weldcal.models.arms.chain import chain_capsules, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
+from weldcal.models.arms.kinematics import ArmModel, Chain, joint_frames
 from weldcal.models.arms.urdf import link_capsules
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -219,13 +219,13 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
 def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
     """Follow the joint angles of the scans on each branch of the inverse kinematics of a Universal Robots arm."""
     poses = [data.poses[id] for id in ids]
-    if arm.name not in known_arms() or not ids:
+    if not isinstance(arm, ArmModel) or not ids:
         return []
-    model, out = load_arm(arm.name), []
-    for first in inverse_kinematics(model, poses[0]):
+    out = []
+    for first in inverse_kinematics(arm, poses[0]):
         row: list[Array | None] = [first]
         for X in poses[1:]:
-            row.append(None if row[-1] is None else nearest_solution(model, X, row[-1]))
+            row.append(None if row[-1] is None else nearest_solution(arm, X, row[-1]))
         out.append([q for q in row if q is not None])
     return [row for row in out if len(row) == len(ids)]
 
@@ -233,8 +233,8 @@ def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
     """Return the capsules of an arm at joint angles (n,) rad."""
     frames = [np.eye(4), *joint_frames(arm.stack, q)]
-    if arm.name in known_arms():
-        rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(load_arm(arm.name))]
+    if isinstance(arm, ArmModel):
+        rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(arm)]
     else:
         rows = [(int(k), np.array(v[:3]), np.array(v[3:6]), v[6]) for k, *v in chain_capsules(arm.name)]
     ends = [[frames[k][:3, :3] @ p + frames[k][:3, 3] for p in (a, b)] for k, a, b, _ in rows]

@@ -15,7 +15,7 @@ from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, flange_poses, inverse, pose, skew
-from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 
 KINDS = ("joints", "links")

@@ -146,7 +146,7 @@ def test_near_means_cheap_for_the_slow_joints() -> None:
 def test_angles_that_are_no_numbers_are_refused() -> None:
     arm = load_arm()
     X_BF = forward_kinematics(arm, np.zeros(6))
-    with pytest.raises(InputError, match="six finite"):
+    with pytest.raises(InputError, match="6 finite"):
         nearest_solution(arm, X_BF, [0, 0, 0, 0, 0, np.nan])
     with pytest.raises(InputError, match="finite"):
         inverse_kinematics(arm, RigidTransform([np.nan, 0, 0]))

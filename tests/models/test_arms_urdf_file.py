@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.models.arms.chain import chain_forward, chain_inverse, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.errors import InputError
@@ -48,7 +49,7 @@ def test_our_own_urdf_is_the_arm_again(tmp_path: Path) -> None:
     assert chain.position_upper == pytest.approx(arm.position_upper)
     assert chain.velocity_limit == pytest.approx(arm.velocity_limit)
     for q in np.random.default_rng(0).uniform(-2.0, 2.0, (5, 6)):
-        assert chain_forward(chain, q).IsNearlyEqualTo(forward_kinematics(arm, q), 1e-9)
+        assert forward_kinematics(chain, q).IsNearlyEqualTo(forward_kinematics(arm, q), 1e-9)
 
 
 def test_axes_bases_and_grippers_of_other_makers(tmp_path: Path) -> None:
@@ -64,12 +65,12 @@ def test_axes_bases_and_grippers_of_other_makers(tmp_path: Path) -> None:
     p = p + R @ [0.1, 0.0, 0.2]
     R = R @ rotation([0, 0, 1], 1.1)
     p, R = p + R @ [0.0, 0.0, 0.1], R @ rotation([0, 0, 1], 0.5)
-    found = chain_forward(chain, q)
+    found = forward_kinematics(chain, q)
     assert found.translation() == pytest.approx(p)
     assert found.rotation().matrix() == pytest.approx(R)
-    again = chain_inverse(chain, found, q + 0.05)
+    again = nearest_solution(chain, found, q + 0.05)
     assert again is not None
-    assert chain_forward(chain, again).IsNearlyEqualTo(found, 1e-7)
+    assert forward_kinematics(chain, again).IsNearlyEqualTo(found, 1e-7)
 
 
 @pytest.mark.parametrize(

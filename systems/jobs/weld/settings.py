@@ -14,7 +14,6 @@ from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
-from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
@@ -298,7 +297,7 @@ def _telling_of_the_arm(
             continue
         q = np.array([p.q for p in pool])
         guess, kind = scenario.calibration.mounting_guess.pose(), scenario.calibration.refine
-        return [pool[i] for i in informative_poses(chain_of(station.arm), guess, q, wanted, kind)]
+        return [pool[i] for i in informative_poses(station.arm, guess, q, wanted, kind)]
     return planned(config, wanted)
 
 
