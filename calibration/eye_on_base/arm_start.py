@@ -20,10 +20,10 @@ from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, frames_along, pose
-from weldcal.models.arms.chain import chain_capsules, known_chains, load_chain
+from weldcal.models.arms.chain import known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, Chain, joint_frames
-from weldcal.models.arms.urdf import link_capsules
+from weldcal.models.arms.kinematics import ArmModel, Chain, joint_frames, link_frames
+from weldcal.models.arms.shape import arm_capsules
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
@@ -232,13 +232,9 @@ def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
     """Return the capsules of an arm at joint angles (n,) rad."""
-    frames = [np.eye(4), *joint_frames(arm.stack, q)]
-    if isinstance(arm, ArmModel):
-        rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(arm)]
-    else:
-        rows = [(int(k), np.array(v[:3]), np.array(v[3:6]), v[6]) for k, *v in chain_capsules(arm.name)]
-    ends = [[frames[k][:3, :3] @ p + frames[k][:3, 3] for p in (a, b)] for k, a, b, _ in rows]
-    return ArmShape(np.array(ends), np.array([r for *_, r in rows]))
+    frames, bodies = link_frames(arm, q), arm_capsules(arm)
+    ends = [[frames[c.link_index] @ p for p in (c.p_start, c.p_end)] for c in bodies]
+    return ArmShape(np.array(ends), np.array([c.radius for c in bodies]))
 
 
 def capsule_distance(points: Array, shape: ArmShape) -> tuple[Array, Array]:

@@ -18,12 +18,15 @@ from weldcal.calibration.planning.clearance import (
     occludes,
     self_distance,
 )
-from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution, why_unreached
+from weldcal.models.arms.kinematics import Chain, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
+
+_STARTS = 150  # views tried for a start posture: a choice, about 1 s
+_NO_VIEW = "the flange does not fit into the scanner's field of view"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +63,7 @@ class PlannerConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPose:
-    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR.
+    """One pose to visit: flange X_BF, joints q (n,) rad, feature X_BR.
 
     ``gain`` in log determinant of the information of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a
     scanned point at the work point once this pose is in.
@@ -74,7 +77,7 @@ class PlannedPose:
 
 
 def plan_calibration_poses(
-    arm: ArmModel,
+    arm: Chain,
     X_FR: RigidTransform,
     X_BC_guess: RigidTransform,
     scanner: ScannerPreset,
@@ -119,7 +122,7 @@ def predicted_sigma(
 
 
 def _candidates(
-    arm: ArmModel,
+    arm: Chain,
     X_FR: RigidTransform,
     X_BC: RigidTransform,
     scanner: ScannerPreset,
@@ -130,26 +133,22 @@ def _candidates(
     rng = np.random.default_rng(config.seed)
     bodies = arm_bodies(arm, tool)
     X_RF = X_FR.inverse()
-    reach = float(np.abs(arm.stack[:, :3, 3]).sum())
     pool: list[PlannedPose] = []
     why: Counter[str] = Counter()
-    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
-    ring_R = np.vstack(
-        [config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), np.zeros((1, 3))]
-    )
+    ring_R = _ring(config)
     for _ in range(config.max_trials):
         if len(pool) >= config.candidates:
             break
         X_CR = random_view(rng, scanner, config.feature_radius_m, config.image_margin, config.theta_max_rad)
         if X_CR is None:
-            why["the flange does not fit into the scanner's field of view"] += 1
+            why[_NO_VIEW] += 1
             continue
         X_BR = X_BC @ X_CR
         X_BF = X_BR @ X_RF
         q, reason = None, "the scanner's working range is out of the arm's reach"
         if float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m:
             reason = "the table is in the way"
-        elif float(np.linalg.norm(X_BF.translation())) <= reach:
+        else:
             q = nearest_solution(arm, X_BF, q_start)
         if q is not None:
             reason = why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, q_start, config)
@@ -158,6 +157,49 @@ def _candidates(
         else:
             pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
     return pool, why
+
+
+def _ring(config: PlannerConfig) -> Array:
+    """Points (9, 3) m of the feature in its frame: eight of its edge and its centre."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    edge = config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
+    return np.vstack([edge, np.zeros((1, 3))])
+
+
+def start_posture(
+    arm: Chain,
+    X_FR: RigidTransform,
+    X_BC: RigidTransform,
+    scanner: ScannerPreset,
+    config: PlannerConfig,
+    tool: Sequence[Capsule] = (),
+) -> Array:
+    """Choose clear joint angles (n,) rad that hold the feature to the scanner, from which most such others are near.
+
+    Raises:
+        UnreachableScanner: no such joint angles; the message names the commonest obstacle.
+    """
+    bodies, why, rng = arm_bodies(arm, tool), Counter[str](), np.random.default_rng(config.seed)
+    clear: list[Array] = []
+    for _ in range(_STARTS):
+        X_CR = random_view(rng, scanner, config.feature_radius_m, config.image_margin, config.theta_max_rad)
+        if X_CR is None:
+            why[_NO_VIEW] += 1
+            continue
+        X_BR = X_BC @ X_CR
+        X_BF = X_BR @ X_FR.inverse()
+        found = inverse_kinematics(arm, X_BF)
+        if not len(found):
+            why[why_unreached(arm, X_BF)] += 1
+        for q in found:
+            if reason := why_not(arm, q, X_BC, (X_BR @ _ring(config).T).T, bodies, q, config):
+                why[reason] += 1
+            else:
+                clear.append(q)
+    if not clear:
+        raise UnreachableScanner(_explain(why, 0, 1))
+    travel = np.abs(np.array(clear)[:, None] - np.array(clear)).max(axis=2)
+    return clear[int(np.argmax(np.sum(travel <= config.max_travel_rad, axis=1)))]
 
 
 def random_view(
@@ -190,7 +232,7 @@ def random_view(
 
 
 def why_not(
-    arm: ArmModel,
+    arm: Chain,
     q: Array,
     X_BC: RigidTransform,
     points_B: Array,

@@ -110,6 +110,7 @@ def read_urdf_chain(path: Path) -> Chain:
         position_lower=np.where(np.isfinite(low), low, -UNLIMITED_RAD),
         position_upper=np.where(np.isfinite(high), high, UNLIMITED_RAD),
         velocity_limit=np.where(np.isfinite(speed), speed, np.pi),
+        file=path,
     )
 
 
@@ -142,8 +143,10 @@ def _parsed(path: Path) -> tuple[ET.Element, Any, dict[str, Any], dict[str, Any]
     return robot, plant, bodies, above
 
 
-def urdf_links(path: Path, q: ArrayLike) -> list[tuple[ET.Element, RigidTransform]]:
+def urdf_links(path: Path, q: ArrayLike) -> list[tuple[ET.Element, RigidTransform, int]]:
     """All links of a URDF file with their poses X_BL, at the angles q (n,) rad of its chain, other joints at zero.
+
+    The third entry is how many joints of the chain carry the link: 0 for the base.
 
     Raises InputError: see read_urdf_chain, or another number of angles.
     """
@@ -156,7 +159,14 @@ def urdf_links(path: Path, q: ArrayLike) -> list[tuple[ET.Element, RigidTransfor
     for joint, angle in zip(joints, angles, strict=True):
         joint.set_angle(context, angle)
     X_BW = bodies[base].EvalPoseInWorld(context).inverse()
-    return [(e, X_BW @ bodies[e.get("name", "")].EvalPoseInWorld(context)) for e in robot.iter("link")]
+    found = []
+    for e in robot.iter("link"):
+        name = carrier = e.get("name", "")
+        while carrier in above and above[carrier] not in joints:
+            carrier = above[carrier].parent_body().name()
+        carried = joints.index(above[carrier]) + 1 if carrier in above else 0
+        found.append((e, X_BW @ bodies[name].EvalPoseInWorld(context), carried))
+    return found
 
 
 def _base(bodies: dict[str, Any], above: dict[str, Any]) -> str:

@@ -52,11 +52,12 @@ def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None 
     starts = _branches(arm, R, p, _wrapped(stay)[5]) if isinstance(arm, ArmModel) else _starts(arm, goal, stay)
     if near is not None:
         starts = np.vstack([starts, stay])
+    q = _wrapped(_polish(arm, R, p, starts))
+    q = q[np.all((q >= arm.position_lower - _SAME_RAD) & (q <= arm.position_upper + _SAME_RAD), axis=1)]
     found: list[Array] = []
-    for q in _wrapped(_polish(arm, R, p, starts)):
-        inside = np.all((q >= arm.position_lower - _SAME_RAD) & (q <= arm.position_upper + _SAME_RAD))
-        if inside and all(np.abs(_wrapped(q - other)).max() > _SAME_RAD for other in found):
-            found.append(np.clip(q, arm.position_lower, arm.position_upper))
+    while len(q):
+        found.append(np.clip(q[0], arm.position_lower, arm.position_upper))
+        q = q[np.abs(_wrapped(q - q[0])).max(axis=1) > _SAME_RAD]
     return np.reshape(found, (-1, arm.n))
 
 
@@ -72,7 +73,7 @@ def why_unreached(arm: Chain, X_BF: RigidTransform) -> str:
     least = int(np.argmin(outside.max(axis=1)))
     joint = int(np.argmax(outside[least]))
     low, high, angle = np.degrees([arm.position_lower[joint], arm.position_upper[joint], found[least, joint]])
-    return f"joint {joint + 1} would be at {angle:.0f} deg, and its limits are {low:.0f} to {high:.0f} deg"
+    return f"joint {joint + 1} would be at {angle:.1f} deg, and its limits are {low:.1f} to {high:.1f} deg"
 
 
 def nearest_solution(arm: Chain, X_BF: RigidTransform, q_near: ArrayLike) -> Array | None:

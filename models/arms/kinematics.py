@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,7 +71,7 @@ class Chain:
     """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis.
 
     ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s. up (3,) is the unit vector against gravity
-    in B: +z of an arm that stands.
+    in B: +z of an arm that stands. ``file`` is the URDF that the arm is read from.
     """
 
     name: str
@@ -82,6 +82,7 @@ class Chain:
     position_upper: Array
     velocity_limit: Array
     up: Array = field(default_factory=lambda: _frozen([0.0, 0.0, 1.0]))
+    file: Path | None = None
 
     @property
     def n(self) -> int:
@@ -119,6 +120,9 @@ class ArmModel(Chain):
     def transforms(self) -> tuple[RigidTransform, ...]:
         """The six link transforms X_{i-1,i}(0)."""
         return tuple(_rigid(X[:3, :3], X[:3, 3]) for X in self.stack)
+
+
+_Arm = TypeVar("_Arm", bound=Chain)
 
 
 def known_arms() -> tuple[str, ...]:
@@ -190,7 +194,7 @@ def _nominal(name: str) -> ArmModel:
     )
 
 
-def mounted(arm: ArmModel, X_WB: RigidTransform) -> ArmModel:
+def mounted(arm: _Arm, X_WB: RigidTransform) -> _Arm:
     """Return the same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
     # exactly +z for an upright base: rounding must not change a plan
     up = X_WB.rotation().matrix()[2]

@@ -25,6 +25,7 @@ from weldcal.calibration.eye_on_base.arm_start import (
 )
 from weldcal.models.arms.chain import known_chains, load_chain
 from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.recorded import calibrate_dataset
 
@@ -79,7 +80,7 @@ def test_three_far_flanges_are_enough_beside_the_arm(tmp_path: Path) -> None:
 
 def test_without_joint_angles_a_franka_is_refused(tmp_path: Path) -> None:
     write_cell(cell(FAR), tmp_path / "cell", joints=False)
-    with pytest.raises((TooFewPoses, ValueError), match=r"usable poses|clouds can be used"):
+    with pytest.raises((TooFewPoses, InputError), match=r"usable poses|clouds can be used"):
         calibrate_dataset(tmp_path / "cell", tmp_path / "out")
 
 
