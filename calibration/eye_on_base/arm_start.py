@@ -22,7 +22,7 @@ from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, frames_along, pose
 from weldcal.models.arms.chain import known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, Chain, joint_frames, link_frames
+from weldcal.models.arms.kinematics import ArmModel, Chain, chain_poses, link_frames
 from weldcal.models.arms.shape import arm_capsules
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -211,7 +211,7 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
         return {}
     if q is None:
         return {}
-    reached = [(joint_frames(arm.stack, one)[-1] @ arm.X_LF)[:3, 3] for one in q]
+    reached = chain_poses(arm, q)[:, :3, 3]
     off = max(float(np.linalg.norm(p - data.poses[id].translation())) for p, id in zip(reached, ids, strict=True))
     return dict(zip(ids, q, strict=True)) if off < _JOINTS_M else {}
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.models.arms.dh import dh_frames, dh_parameters
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.dh import dh_frames
 from weldcal.models.errors import InputError
 
 # Joint 1 turns the base and joint 6 the flange: their offsets are part of other unknowns.
@@ -68,11 +67,6 @@ class DhArm:
         if dh.shape != (6, 4) or not np.isfinite(dh).all():
             raise InputError(f"An arm's table has six finite rows [a, alpha, d, theta], not the shape {dh.shape}.")
         return DhArm(dh)
-
-    @staticmethod
-    def of(arm: ArmModel) -> DhArm:
-        """Return a UR arm's table, by the nominal lengths of its model."""
-        return DhArm(dh_parameters(arm))
 
     def frames(self, q: Floats) -> Floats:
         """Homogeneous poses (n, 7, 4, 4) of the base and of the frames after each joint, for joints (n, 6) rad."""

@@ -26,6 +26,7 @@ _BRANCH_GAP_RAD = 0.1
 # Parallel and meeting axes make the elimination singular: its links are bent by this share of the arm's size, and rad.
 # Tried on eight arms, 300 poses each: with 1e-4 it loses one branch in fifty, with 3e-3 one in a thousand.
 _BEND = 1e-3
+_BENT = 5  # times that an arm is bent at most
 _HALF_REAL = 0.5  # rad: the imaginary part up to which a complex angle seeds Newton; a bend makes some of a pair of two
 _SHIFT_RAD = 0.3  # of the eliminated joint: its half turn, which tan cannot say, lies at no angle that people choose
 _HELD = 8  # angles of the third joint of a seven-axis arm: a choice
@@ -49,16 +50,20 @@ def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None 
         return np.empty((0, arm.n))
     stay = np.zeros(arm.n) if near is None else np.asarray(near, dtype=np.float64)
     R, p = goal[:3, :3], goal[:3, 3]
-    starts = _branches(arm, R, p, _wrapped(stay)[5]) if isinstance(arm, ArmModel) else _starts(arm, goal, stay)
-    if near is not None:
-        starts = np.vstack([starts, stay])
-    q = _wrapped(_polish(arm, R, p, starts))
-    q = q[np.all((q >= arm.position_lower - _SAME_RAD) & (q <= arm.position_upper + _SAME_RAD), axis=1)]
+    starts = np.empty((0, arm.n)) if near is None else stay[None]
     found: list[Array] = []
-    while len(q):
-        found.append(np.clip(q[0], arm.position_lower, arm.position_upper))
-        q = q[np.abs(_wrapped(q - q[0])).max(axis=1) > _SAME_RAD]
-    return np.reshape(found, (-1, arm.n))
+    for bends in _BENDS:
+        own = _branches(arm, R, p, _wrapped(stay)[5]) if isinstance(arm, ArmModel) else _starts(arm, goal, stay, bends)
+        left = np.vstack([np.reshape(found, (-1, arm.n)), _wrapped(_polish(arm, R, p, np.vstack([own, starts])))])
+        found = []
+        while len(left):
+            found.append(left[0])
+            left = left[np.abs(_wrapped(left - left[0])).max(axis=1) > _SAME_RAD]
+        if isinstance(arm, ArmModel) or arm.n != 6 or len(found) % 2 == 0:
+            break  # the real solutions of six joints come in pairs: an odd one says that a singularity hides another
+    q = np.reshape(found, (-1, arm.n))
+    q = q[np.all((q >= arm.position_lower - _SAME_RAD) & (q <= arm.position_upper + _SAME_RAD), axis=1)]
+    return np.clip(q, arm.position_lower, arm.position_upper)
 
 
 def why_unreached(arm: Chain, X_BF: RigidTransform) -> str:
@@ -116,31 +121,31 @@ def _beyond_m(arm: Chain, goal: Array) -> float:
     return float(np.linalg.norm(goal[:3, 3] - arm.stack[0, :3, 3]) - size)
 
 
-def _starts(arm: Chain, goal: Array, near: Array) -> Array:
+def _starts(arm: Chain, goal: Array, near: Array, bends: Array) -> Array:
     """Joint angles (m, n) rad near all solutions of an arm: as of six joints, some held still or none of its own."""
-    n, pads = arm.n, _BENDS[0][: max(6 - arm.n, 0)]
+    n, pads = arm.n, _PADS[: max(6 - arm.n, 0)]
     X_LF, stack = arm.X_LF, np.vstack([arm.stack, pads])
     for pad in pads[::-1]:
         X_LF = _inverse(pad) @ X_LF
     if n <= 6:
-        return _six_joint_starts(stack, X_LF, goal)[:, :n]
+        return _six_joint_starts(stack, X_LF, goal, bends)[:, :n]
     inner = slice(2, n - 4)
     held = np.linspace(arm.position_lower[inner], arm.position_upper[inner], _HELD + 1)[1:]
     starts = []
     for angles in [near[inner], *held]:
         link = joint_frames(stack[inner], angles)[-1] @ stack[n - 4]
-        six = _six_joint_starts(np.array([*stack[:2], link, *stack[n - 3 :]]), X_LF, goal)
+        six = _six_joint_starts(np.array([*stack[:2], link, *stack[n - 3 :]]), X_LF, goal, bends)
         starts.append(np.hstack([six[:, :2], np.tile(angles, (len(six), 1)), six[:, 2:]]))
     return np.vstack(starts)
 
 
-def _six_joint_starts(stack: Array, X_LF: Array, goal: Array) -> Array:
+def _six_joint_starts(stack: Array, X_LF: Array, goal: Array, bends: Array) -> Array:
     """Joint angles (m, 6) rad near all solutions of six joints, from two bends and two joints eliminated last."""
     loop = np.array([*stack[1:], X_LF @ _inverse(goal) @ stack[0]])
     loop[:, :3, 3] /= np.linalg.norm(loop[:, :3, 3], axis=1).sum()
     starts = []
-    for first, bends in zip((0, 3), _BENDS, strict=True):
-        bent = np.array([*(loop[:5] @ bends), loop[5]])
+    for first, bend in zip((0, 3), bends, strict=True):
+        bent = np.array([*(loop[:5] @ bend), loop[5]])
         starts.append(np.roll(_loop_angles(np.roll(bent, -first, axis=0)), first, axis=1))
     return np.vstack(starts)
 
@@ -197,13 +202,14 @@ def _inverse(X: Array) -> Array:
     return np.asarray(np.linalg.inv(X))
 
 
-def _bends(seed: int) -> Array:
-    """Small motions (5, 4, 4) without any symmetry, rad and shares of the arm's size."""
-    rolls, shifts = _BEND * np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 5, 3))
-    return np.array([RigidTransform(RollPitchYaw(r), t).GetAsMatrix4() for r, t in zip(rolls, shifts, strict=True)])
+def _small_motions(count: int, size: float) -> Array:
+    """Motions (count, 4, 4) without any symmetry, up to ``size`` in rad and m."""
+    drawn = size * np.random.default_rng(0).uniform(-1.0, 1.0, (count, 6))
+    return np.array([RigidTransform(RollPitchYaw(v[:3]), v[3:]).GetAsMatrix4() for v in drawn])
 
 
-_BENDS = (_bends(0), _bends(1))
+_BENDS = _small_motions(10 * _BENT, _BEND).reshape(_BENT, 2, 5, 4, 4)
+_PADS = _small_motions(3, 1.0)  # joints that an arm of fewer than six has not: of no special geometry
 _THIRDS = joint_frames(np.eye(4)[None], 2.0 * np.pi / 3.0 * np.arange(3.0)[:, None])[:, 0]
 _FOURIER = np.exp(-2j * np.pi / 3.0 * np.outer([-1.0, 0.0, 1.0], np.arange(3.0))) / 3.0
 

@@ -116,11 +116,6 @@ class ArmModel(Chain):
     housings: Housings
     calibration: str | None = None
 
-    @property
-    def transforms(self) -> tuple[RigidTransform, ...]:
-        """The six link transforms X_{i-1,i}(0)."""
-        return tuple(_rigid(X[:3, :3], X[:3, 3]) for X in self.stack)
-
 
 _Arm = TypeVar("_Arm", bound=Chain)
 
@@ -146,11 +141,8 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
     nominal = _nominal(name)
     if kinematics is None:
         return nominal
-    stack, calibration = _read_kinematics(Path(kinematics))
-    stack = _slide_to_nominal(stack, nominal.stack)
     advice = f"give the calibration of a {name}, in metres and radians"
-    _require_same_arm(stack, nominal.stack, name, Path(kinematics).name, advice)
-    return replace(nominal, stack=_frozen(stack), calibration=calibration)
+    return with_link_transforms(nominal, *_read_kinematics(Path(kinematics)), Path(kinematics).name, advice)
 
 
 @lru_cache(maxsize=8)
@@ -201,19 +193,24 @@ def mounted(arm: _Arm, X_WB: RigidTransform) -> _Arm:
     return replace(arm, up=_frozen(np.where(np.abs(up - np.round(up)) < 1e-12, np.round(up), up)))
 
 
-def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:
+def with_link_transforms(
+    arm: ArmModel, stack: Array, calibration: str | None, source: str, advice: str = ""
+) -> ArmModel:
     """Return the same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
 
     As in `load_arm`, the link frames are slid along their own joint axes to where those of `arm` lie, which changes no
     flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these
-    are.
+    are, `advice` what to do.
 
     Raises:
         InputError: the transforms are another arm's.
     """
     stack = _slide_to_nominal(stack, arm.stack)
-    advice = f"connect a {arm.name}, or name this robot's arm in the scenario"
-    _require_same_arm(stack, arm.stack, arm.name, source, advice)
+    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
+    shift = (joint_frames(stack, postures) - joint_frames(arm.stack, postures))[:, 5, :3, 3]
+    if not (largest := float(np.linalg.norm(shift, axis=1).max())) <= MAX_CALIBRATION_SHIFT_M:
+        advice = advice or f"connect a {arm.name}, or name this robot's arm in the scenario"
+        raise InputError(f"{source} moves the flange by {largest * 1e3:.0f} mm from a nominal {arm.name}: {advice}.")
     return replace(arm, stack=_frozen(stack), calibration=calibration)
 
 
@@ -300,14 +297,6 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
     out[:, :3, 3] += out[:, :3, 2] * slide[:, None]
     out[1:, 2, 3] -= slide[:-1]
     return out
-
-
-def _require_same_arm(stack: Array, nominal: Array, name: str, source: str, advice: str) -> None:
-    """Raise InputError where the calibrated flange strays far from the nominal one in some fixed set of postures."""
-    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
-    shift = max(float(np.linalg.norm((joint_frames(stack, q) - joint_frames(nominal, q))[5, :3, 3])) for q in postures)
-    if not shift <= MAX_CALIBRATION_SHIFT_M:
-        raise InputError(f"{source} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: {advice}.")
 
 
 def _read_kinematics(path: Path) -> tuple[Array, str]:

@@ -31,7 +31,7 @@ class BodyShape:
     name: str
     X_BL: RigidTransform
     meshes: Sequence[TriMesh]
-    link: int
+    link: int = 0
 
     def distances(self, points_B: Array, reach_m: float) -> Array:
         """Distances (N,) m of points (N, 3) m of B from the surface, negative inside closed meshes.

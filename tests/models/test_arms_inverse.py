@@ -1,4 +1,4 @@
-"""Every flange pose a UR can reach is found from all sides, exactly, on nominal and on calibrated kinematics."""
+"""Every flange pose that an arm can reach is found from all sides, exactly, on nominal and calibrated kinematics."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.inverse import RESIDUAL, inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm, sigma_min
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import RESIDUAL, inverse_kinematics, nearest_solution, why_unreached
+from weldcal.models.arms.kinematics import ArmModel, Chain, forward_kinematics, load_arm, sigma_min
 from weldcal.models.arms.kinematics import jacobian as arm_jacobian
 from weldcal.models.errors import InputError
 
@@ -150,3 +151,117 @@ def test_angles_that_are_no_numbers_are_refused() -> None:
         nearest_solution(arm, X_BF, [0, 0, 0, 0, 0, np.nan])
     with pytest.raises(InputError, match="finite"):
         inverse_kinematics(arm, RigidTransform([np.nan, 0, 0]))
+
+
+QUARTER = np.pi / 2
+# Rows of d (m), a (m), alpha (rad) after the makers' data sheets and URDFs.
+TABLES = {
+    # spherical wrist, elbow off the forearm's axis
+    "abb_irb120": [(0.29, 0, -QUARTER), (0, 0.27, 0), (0, 0.07, -QUARTER), (0.302, 0, QUARTER), (0, 0, -QUARTER), (0.072, 0, 0)],
+    # spherical wrist, shoulder off the first axis
+    "kuka_kr16": [(0.675, 0.26, -QUARTER), (0, 0.68, 0), (0, 0.035, -QUARTER), (0.67, 0, QUARTER), (0, 0, -QUARTER), (0.158, 0, 0)],
+    # three parallel axes
+    "techman_tm5": [(0.1452, 0, -QUARTER), (0, 0.429, 0), (0, 0.4115, 0), (-0.1223, 0, QUARTER), (0.106, 0, QUARTER), (0.1144, 0, 0)],
+    # neither: an offset between axes 4 and 6
+    "fanuc_crx10": [(0.245, 0, -QUARTER), (0, 0.71, np.pi), (0, 0, -QUARTER), (-0.54, 0, QUARTER), (0.15, 0, -QUARTER), (-0.16, 0, np.pi)],
+    # neither: axes 5 and 6 do not meet
+    "xarm6": [(0.267, 0, -QUARTER), (0, 0.28949, 0), (0, 0.0775, -QUARTER), (0.3425, 0, QUARTER), (0, 0.076, -QUARTER), (0.097, 0, 0)],
+}  # fmt: skip
+
+
+def pose_by_table(name: str, q: Array) -> Array:
+    """Poses (..., 4, 4) of the flange by the Denavit-Hartenberg formula, written out."""
+    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+    for k, (d, a, alpha) in enumerate(TABLES[name]):
+        c, s, ca, sa, o = np.cos(q[..., k]), np.sin(q[..., k]), np.cos(alpha), np.sin(alpha), 0.0 * q[..., k]
+        rows = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [o, o + sa, o + ca, o + d], [o, o, o, o + 1]]
+        X = X @ np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    return X
+
+
+def arm_by_table(name: str, turn: float = np.pi) -> Chain:
+    links = [RigidTransform(RollPitchYaw(alpha, 0, 0), [a, 0, d]).GetAsMatrix4() for d, a, alpha in TABLES[name]]
+    limit = np.full(6, turn)
+    return Chain(
+        name=name,
+        joint_names=tuple("123456"),
+        stack=np.array([np.eye(4), *links[:5]]),
+        X_LF=links[5],
+        position_lower=-limit,
+        position_upper=limit,
+        velocity_limit=np.ones(6),
+    )
+
+
+def as_pose(X: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
+
+
+def found_by_many_starts(name: str, X: Array, rng: np.random.Generator, starts: int = 600) -> Array:
+    """Solutions (k, 6) that Gauss-Newton with differences finds from random starts, on the table alone."""
+    q, h = rng.uniform(-np.pi, np.pi, (starts, 6)), 1e-6
+
+    def off(q: Array) -> Array:
+        return np.asarray((pose_by_table(name, q) - X)[..., :3, :].reshape(*q.shape[:-1], 12))
+
+    for _ in range(40):
+        e = off(q)
+        J = np.swapaxes((off(q[:, None] + h * np.eye(6)) - off(q[:, None] - h * np.eye(6))) / (2 * h), 1, 2)
+        normal = np.swapaxes(J, 1, 2) @ J + np.clip((e * e).sum(axis=1), 1e-12, 1e-2)[:, None, None] * np.eye(6)
+        step = np.linalg.solve(normal, np.einsum("nij,ni->nj", J, e)[..., None])[..., 0]
+        q = q - step * np.minimum(1.0, 0.5 / np.abs(step).max(axis=1))[:, None]
+    q = q[np.abs(off(q)).max(axis=1) < 1e-9]
+    kept: list[Array] = []
+    for one in q:
+        if all(apart(one, other) > 1e-3 for other in kept):
+            kept.append(one)
+    return np.array(kept)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_arms_of_other_makers_are_found_from_all_sides(name: str) -> None:
+    arm = arm_by_table(name)
+    for q in np.random.default_rng(3).uniform(-np.pi, np.pi, (150, 6)):
+        X = pose_by_table(name, q)
+        solutions = inverse_kinematics(arm, as_pose(X))
+        assert np.abs(pose_by_table(name, solutions) - X).max() < 1e-8
+        assert min(apart(q, other) for other in solutions) < 1e-6
+        assert 2 <= len(solutions) <= 16
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_no_solution_of_a_dense_search_is_missed(name: str) -> None:
+    arm, rng = arm_by_table(name), np.random.default_rng(4)
+    for q in rng.uniform(-np.pi, np.pi, (2, 6)):
+        X = pose_by_table(name, q)
+        solutions = inverse_kinematics(arm, as_pose(X))
+        dense = found_by_many_starts(name, X, rng)
+        assert len(dense) >= 2
+        assert all(min(apart(one, other) for other in solutions) < 1e-5 for one in dense)
+
+
+def test_what_is_out_of_reach_has_a_reason() -> None:
+    arm, R = arm_by_table("abb_irb120"), RollPitchYaw(np.pi, 0, 0)
+    far, inside = RigidTransform(R, [1.3, 0.0, 0.3]), RigidTransform(R, [0.0, 0.0, 0.2])
+    assert inverse_kinematics(arm, far).shape == inverse_kinematics(arm, inside).shape == (0, 6)
+    assert "farther away than all links" in why_unreached(arm, far)
+    assert "no joint angles" in why_unreached(arm, inside)
+    q = np.array([1.0, -0.3, 0.3, 0.5, 0.6, 0.2])
+    X_BF, short = as_pose(pose_by_table("abb_irb120", q)), arm_by_table("abb_irb120", 0.4)
+    assert len(inverse_kinematics(arm, X_BF)) > 0
+    assert len(inverse_kinematics(short, X_BF)) == 0
+    assert "joint 1 would be at 57.3 deg, and its limits are -22.9 to 22.9 deg" in why_unreached(short, X_BF)
+
+
+def test_seven_joints_keep_to_the_angles_they_have() -> None:
+    arm = load_chain("franka_panda")
+    middle = 0.5 * (arm.position_lower + arm.position_upper)
+    for shift in np.random.default_rng(5).uniform(-0.5, 0.5, (5, 7)):
+        q = middle + shift
+        X_BF = forward_kinematics(arm, q)
+        found = nearest_solution(arm, X_BF, q)
+        assert found is not None
+        np.testing.assert_allclose(found, q, rtol=0, atol=1e-6)
+        others = inverse_kinematics(arm, X_BF)
+        assert len(others) > 4
+        assert all(forward_kinematics(arm, one).IsNearlyEqualTo(X_BF, 1e-8) for one in others)

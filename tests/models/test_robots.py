@@ -15,7 +15,7 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
-from weldcal.models.robots import CLOSED_FORM, FACTS, ROBOTS, get_robot
+from weldcal.models.robots import FACTS, ROBOTS, get_robot
 from weldcal.models.scanners import SCANNERS
 
 Array = NDArray[np.float64]
@@ -156,7 +156,7 @@ def test_every_robot_has_a_flange_and_known_names_are_told() -> None:
     for robot in ROBOTS.values():
         large = robot.name in ("ur20", "ur30")
         assert robot.standard.designation == ("iso9409-1-80-6-m8" if large else "iso9409-1-50-4-m6")
-        assert (robot.inverse == CLOSED_FORM) == robot.name.startswith("ur")
+        assert (robot.inverse == "all") == (not robot.name.startswith("franka"))
     assert get_robot("franka").name == "franka_panda"
     assert get_robot("UR10e").payload_kg == 12.5
     with pytest.raises(InputError, match="use one of ur3e"):

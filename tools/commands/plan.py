@@ -13,6 +13,7 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import LEAST
 from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
 from weldcal.models.arms.kinematics import ArmModel, mounted
+from weldcal.models.arms.shape import TUBE_M, arm_capsules
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic
 from weldcal.models.robots import get_chain
@@ -57,7 +58,7 @@ def plan_poses(
         seed=call.seed,
         progress=call.progress,
     )
-    values = {k: found[k] for k in ("scans", "chosen_from", "written_to")}
+    values = {k: found[k] for k in ("scans", "chosen_from", "bodies", "written_to") if k in found}
     return Outcome(found, values={k.replace("_", " "): v for k, v in values.items()})
 
 
@@ -118,6 +119,8 @@ def plan_refining_poses(
         "turn_deg": turn_deg([p.X_BF for p in chosen]),
         "joints_deg": [[round(float(v), 3) for v in np.degrees(p.q)] for p in chosen],
     }
+    if arm.file is not None and all(c.radius == TUBE_M for c in arm_capsules(arm)):
+        result["bodies"] = f"{arm.name} has no shapes: its links are tubes of {2e3 * TUBE_M:.0f} mm between the joints."
     write_atomic(out / "poses.csv", csv_text(names, rows))
     if isinstance(arm, ArmModel):
         write_atomic(out / "poses.script", "\n".join(["# move to each pose and scan there", *moves]) + "\n")

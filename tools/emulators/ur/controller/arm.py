@@ -15,7 +15,7 @@ import numpy as np
 
 from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse
 from weldcal.models.arms.inverse import continued_solution
-from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.models.arms.kinematics import ArmModel, chain_poses, kinematics_and_jacobian
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, ControllerMotion, MotionRefused, slowed
@@ -82,10 +82,7 @@ class Compliance:
         self._speed += np.clip(asked - self._speed, -ACCELERATION * STEP_S, ACCELERATION * STEP_S)
         self._moved = self._moved + axes @ self._speed[:3] * STEP_S
         self._turned = exp_rotation(axes @ self._speed[3:] * STEP_S) @ self._turned
-        R, p, _ = kinematics_and_jacobian(model, nominal.q_target)
-        X = np.eye(4)
-        X[:3, :3], X[:3, 3] = R, p
-        X = X @ X_FT
+        X = chain_poses(model, nominal.q_target) @ X_FT
         X[:3, :3], X[:3, 3] = self._turned @ X[:3, :3], X[:3, 3] + self._moved
         found = continued_solution(model, as_transform(X @ inverse(X_FT)), q)
         if found is None:
@@ -290,10 +287,7 @@ class EmulatedArm:
 
     def flange(self, q: Array) -> Array:
         """X_BF (4, 4) at q."""
-        R, p, _ = kinematics_and_jacobian(self.model, q)
-        X = np.eye(4)
-        X[:3, :3], X[:3, 3] = R, p
-        return X
+        return chain_poses(self.model, q)
 
     def flange_goal(self, pose: list[float]) -> Array:
         """X_BF (4, 4) that puts the tool at `pose`."""

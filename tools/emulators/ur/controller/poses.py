@@ -10,7 +10,7 @@ from weldcal.models.arrays import Array
 
 def rotation_vector(R: Array) -> Array:
     """The rotation vector (3,) rad of R, its angle in [0, pi]."""
-    return log_rotation(R[None])[0]
+    return np.asarray(log_rotation(R[None])[0])
 
 
 def matrix(values: Sequence[float] | Array) -> Array:
