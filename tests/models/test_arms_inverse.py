@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.worlds.other_arms import TABLES, pose_by_table
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.inverse import RESIDUAL, inverse_kinematics, nearest_solution, why_unreached
 from weldcal.models.arms.kinematics import ArmModel, Chain, forward_kinematics, load_arm, sigma_min
@@ -153,32 +154,6 @@ def test_angles_that_are_no_numbers_are_refused() -> None:
         inverse_kinematics(arm, RigidTransform([np.nan, 0, 0]))
 
 
-QUARTER = np.pi / 2
-# Rows of d (m), a (m), alpha (rad) after the makers' data sheets and URDFs.
-TABLES = {
-    # spherical wrist, elbow off the forearm's axis
-    "abb_irb120": [(0.29, 0, -QUARTER), (0, 0.27, 0), (0, 0.07, -QUARTER), (0.302, 0, QUARTER), (0, 0, -QUARTER), (0.072, 0, 0)],
-    # spherical wrist, shoulder off the first axis
-    "kuka_kr16": [(0.675, 0.26, -QUARTER), (0, 0.68, 0), (0, 0.035, -QUARTER), (0.67, 0, QUARTER), (0, 0, -QUARTER), (0.158, 0, 0)],
-    # three parallel axes
-    "techman_tm5": [(0.1452, 0, -QUARTER), (0, 0.429, 0), (0, 0.4115, 0), (-0.1223, 0, QUARTER), (0.106, 0, QUARTER), (0.1144, 0, 0)],
-    # neither: an offset between axes 4 and 6
-    "fanuc_crx10": [(0.245, 0, -QUARTER), (0, 0.71, np.pi), (0, 0, -QUARTER), (-0.54, 0, QUARTER), (0.15, 0, -QUARTER), (-0.16, 0, np.pi)],
-    # neither: axes 5 and 6 do not meet
-    "xarm6": [(0.267, 0, -QUARTER), (0, 0.28949, 0), (0, 0.0775, -QUARTER), (0.3425, 0, QUARTER), (0, 0.076, -QUARTER), (0.097, 0, 0)],
-}  # fmt: skip
-
-
-def pose_by_table(name: str, q: Array) -> Array:
-    """Poses (..., 4, 4) of the flange by the Denavit-Hartenberg formula, written out."""
-    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
-    for k, (d, a, alpha) in enumerate(TABLES[name]):
-        c, s, ca, sa, o = np.cos(q[..., k]), np.sin(q[..., k]), np.cos(alpha), np.sin(alpha), 0.0 * q[..., k]
-        rows = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [o, o + sa, o + ca, o + d], [o, o, o, o + 1]]
-        X = X @ np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-    return X
-
-
 def arm_by_table(name: str, turn: float = np.pi) -> Chain:
     links = [RigidTransform(RollPitchYaw(alpha, 0, 0), [a, 0, d]).GetAsMatrix4() for d, a, alpha in TABLES[name]]
     limit = np.full(6, turn)
@@ -209,7 +184,7 @@ def found_by_many_starts(name: str, X: Array, rng: np.random.Generator, starts: 
         J = np.swapaxes((off(q[:, None] + h * np.eye(6)) - off(q[:, None] - h * np.eye(6))) / (2 * h), 1, 2)
         normal = np.swapaxes(J, 1, 2) @ J + np.clip((e * e).sum(axis=1), 1e-12, 1e-2)[:, None, None] * np.eye(6)
         step = np.linalg.solve(normal, np.einsum("nij,ni->nj", J, e)[..., None])[..., 0]
-        q = q - step * np.minimum(1.0, 0.5 / np.abs(step).max(axis=1))[:, None]
+        q = q - step * np.minimum(1.0, 0.5 / np.maximum(np.abs(step).max(axis=1), 1e-12))[:, None]
     q = q[np.abs(off(q)).max(axis=1) < 1e-9]
     kept: list[Array] = []
     for one in q:

@@ -11,7 +11,8 @@ import pytest
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.arms.shape import arm_capsules
+from weldcal.models.arms.urdf import arm_urdf, link_solids
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_chain
 
@@ -107,3 +108,25 @@ def test_several_ends_need_a_name(tmp_path: Path) -> None:
         load_chain(str(file))
     with pytest.raises(InputError, match="There is no file"):
         load_chain("none.urdf")
+
+
+def test_capsules_enclose_the_shapes_of_a_urdf(tmp_path: Path) -> None:
+    file = tmp_path / "mine.urdf"
+    file.write_text(arm_urdf(load_arm("ur5e")))
+    arm, chain = load_arm("ur5e"), load_chain(str(file))
+    capsules = arm_capsules(chain)
+    assert {c.link_index for c in capsules} == set(range(7))
+    for link in range(7):
+        for solid in link_solids(arm, link):
+            far = np.inf
+            for c in (c for c in capsules if c.link_index == link):
+                axis = c.p_end - c.p_start
+                share = np.clip((solid.vertices - c.p_start) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0)
+                far = min(
+                    far,
+                    float(
+                        (np.linalg.norm(solid.vertices - c.p_start - share[:, None] * axis, axis=1) - c.radius).max()
+                    ),
+                )
+            assert far < 1e-9
+    assert sum(c.radius for c in capsules) < 0.08 * len(capsules)
