@@ -140,14 +140,10 @@ def _starts(arm: Chain, goal: Array, near: Array, bends: Array) -> Array:
 
 
 def _six_joint_starts(stack: Array, X_LF: Array, goal: Array, bends: Array) -> Array:
-    """Joint angles (m, 6) rad near all solutions of six joints, from two bends and two joints eliminated last."""
+    """Joint angles (m, 6) rad near all solutions of six joints, by each of several bends."""
     loop = np.array([*stack[1:], X_LF @ _inverse(goal) @ stack[0]])
     loop[:, :3, 3] /= np.linalg.norm(loop[:, :3, 3], axis=1).sum()
-    starts = []
-    for first, bend in zip((0, 3), bends, strict=True):
-        bent = np.array([*(loop[:5] @ bend), loop[5]])
-        starts.append(np.roll(_loop_angles(np.roll(bent, -first, axis=0)), first, axis=1))
-    return np.vstack(starts)
+    return np.vstack([_loop_angles(np.array([*(loop[:5] @ bend), loop[5]])) for bend in bends])
 
 
 def _loop_angles(L: Array) -> Array:

@@ -215,6 +215,23 @@ def test_no_solution_of_a_dense_search_is_missed(name: str) -> None:
         assert all(min(apart(one, other) for other in solutions) < 1e-5 for one in dense)
 
 
+def test_a_branch_beside_a_singularity_is_found() -> None:
+    # sigma_min is 1e-4 here, and the first bend of the arm loses this branch of eight
+    q = np.array(
+        [
+            -2.35038782673197,
+            -0.96389141586579,
+            1.802661997433505,
+            -0.284184830428467,
+            -0.034772503753779,
+            1.79010012161896,
+        ]
+    )
+    solutions = inverse_kinematics(arm_by_table("abb_irb120"), as_pose(pose_by_table("abb_irb120", q)))
+    assert len(solutions) == 8
+    assert min(apart(q, other) for other in solutions) < 1e-6
+
+
 def test_what_is_out_of_reach_has_a_reason() -> None:
     arm, R = arm_by_table("abb_irb120"), RollPitchYaw(np.pi, 0, 0)
     far, inside = RigidTransform(R, [1.3, 0.0, 0.3]), RigidTransform(R, [0.0, 0.0, 0.2])
@@ -228,6 +245,16 @@ def test_what_is_out_of_reach_has_a_reason() -> None:
     assert "joint 1 would be at 57.3 deg, and its limits are -22.9 to 22.9 deg" in why_unreached(short, X_BF)
 
 
+@pytest.mark.parametrize("n", [4, 5])
+def test_fewer_joints_are_found_from_all_sides(n: int) -> None:
+    six = arm_by_table("xarm6")
+    limit = six.position_upper[:n]
+    arm = replace(six, stack=six.stack[:n], position_lower=-limit, position_upper=limit, velocity_limit=np.ones(n))
+    for q in np.random.default_rng(6).uniform(-3.0, 3.0, (30, n)):
+        solutions = inverse_kinematics(arm, forward_kinematics(arm, q))
+        assert min(apart(q, other) for other in solutions) < 1e-6
+
+
 def test_seven_joints_keep_to_the_angles_they_have() -> None:
     arm = load_chain("franka_panda")
     middle = 0.5 * (arm.position_lower + arm.position_upper)
@@ -237,6 +264,8 @@ def test_seven_joints_keep_to_the_angles_they_have() -> None:
         found = nearest_solution(arm, X_BF, q)
         assert found is not None
         np.testing.assert_allclose(found, q, rtol=0, atol=1e-6)
-        others = inverse_kinematics(arm, X_BF)
-        assert len(others) > 4
+        q[2] = arm.position_lower[2] + 0.625 * (arm.position_upper[2] - arm.position_lower[2])
+        X_BF = forward_kinematics(arm, q)
+        others = inverse_kinematics(arm, X_BF)  # of eight angles of the third joint, this one the fifth
+        assert min(apart(q, one) for one in others) < 0.05
         assert all(forward_kinematics(arm, one).IsNearlyEqualTo(X_BF, 1e-8) for one in others)

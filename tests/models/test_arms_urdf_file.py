@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.arms.chain import load_chain
-from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.shape import arm_capsules
 from weldcal.models.arms.urdf import arm_urdf, link_solids
@@ -72,6 +72,8 @@ def test_axes_bases_and_grippers_of_other_makers(tmp_path: Path) -> None:
     again = nearest_solution(chain, found, q + 0.05)
     assert again is not None
     assert forward_kinematics(chain, again).IsNearlyEqualTo(found, 1e-7)
+    # three joints have one way or a few to a pose that they reach
+    assert min(np.abs(one - q).max() for one in inverse_kinematics(chain, found)) < 1e-6
 
 
 @pytest.mark.parametrize(
