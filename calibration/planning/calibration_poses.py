@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -26,7 +26,6 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 
 _STARTS = 150  # views tried for a start posture: a choice, about 1 s
-_NO_VIEW = "the flange does not fit into the scanner's field of view"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,44 +125,46 @@ def _candidates(
     X_FR: RigidTransform,
     X_BC: RigidTransform,
     scanner: ScannerPreset,
-    q_start: Array,
+    q_start: Array | None,
     config: PlannerConfig,
     tool: Sequence[Capsule],
 ) -> tuple[list[PlannedPose], Counter[str]]:
+    """Return what can be scanned near ``q_start``, or with any joint angles, and how often what forbids a view."""
     rng = np.random.default_rng(config.seed)
     bodies = arm_bodies(arm, tool)
     X_RF = X_FR.inverse()
     pool: list[PlannedPose] = []
     why: Counter[str] = Counter()
-    ring_R = _ring(config)
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    ring_R = np.vstack(
+        [config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), np.zeros((1, 3))]
+    )
     for _ in range(config.max_trials):
         if len(pool) >= config.candidates:
             break
         X_CR = random_view(rng, scanner, config.feature_radius_m, config.image_margin, config.theta_max_rad)
         if X_CR is None:
-            why[_NO_VIEW] += 1
+            why["the flange does not fit into the scanner's field of view"] += 1
             continue
         X_BR = X_BC @ X_CR
         X_BF = X_BR @ X_RF
-        q, reason = None, "the scanner's working range is out of the arm's reach"
+        found, reason = [], "the scanner's working range is out of the arm's reach"
         if float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m:
             reason = "the table is in the way"
-        else:
-            q = nearest_solution(arm, X_BF, q_start)
-        if q is not None:
-            reason = why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, q_start, config)
-        if q is None or reason:
+        elif q_start is None:
+            found = [*inverse_kinematics(arm, X_BF)]
+            reason = "" if found else why_unreached(arm, X_BF)
+        elif (q := nearest_solution(arm, X_BF, q_start)) is not None:
+            found = [q]
+        if not found:
             why[reason] += 1
-        else:
-            pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
+        for q in found:
+            start = q if q_start is None else q_start
+            if reason := why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, start, config):
+                why[reason] += 1
+            else:
+                pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
     return pool, why
-
-
-def _ring(config: PlannerConfig) -> Array:
-    """Points (9, 3) m of the feature in its frame: eight of its edge and its centre."""
-    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
-    edge = config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
-    return np.vstack([edge, np.zeros((1, 3))])
 
 
 def start_posture(
@@ -179,27 +180,12 @@ def start_posture(
     Raises:
         UnreachableScanner: no such joint angles; the message names the commonest obstacle.
     """
-    bodies, why, rng = arm_bodies(arm, tool), Counter[str](), np.random.default_rng(config.seed)
-    clear: list[Array] = []
-    for _ in range(_STARTS):
-        X_CR = random_view(rng, scanner, config.feature_radius_m, config.image_margin, config.theta_max_rad)
-        if X_CR is None:
-            why[_NO_VIEW] += 1
-            continue
-        X_BR = X_BC @ X_CR
-        X_BF = X_BR @ X_FR.inverse()
-        found = inverse_kinematics(arm, X_BF)
-        if not len(found):
-            why[why_unreached(arm, X_BF)] += 1
-        for q in found:
-            if reason := why_not(arm, q, X_BC, (X_BR @ _ring(config).T).T, bodies, q, config):
-                why[reason] += 1
-            else:
-                clear.append(q)
-    if not clear:
+    pool, why = _candidates(arm, X_FR, X_BC, scanner, None, replace(config, max_trials=_STARTS), tool)
+    if not pool:
         raise UnreachableScanner(_explain(why, 0, 1))
-    travel = np.abs(np.array(clear)[:, None] - np.array(clear)).max(axis=2)
-    return clear[int(np.argmax(np.sum(travel <= config.max_travel_rad, axis=1)))]
+    q = np.array([c.q for c in pool])
+    near = np.abs(q[:, None] - q).max(axis=2) <= config.max_travel_rad
+    return np.asarray(q[int(np.argmax(near.sum(axis=1)))])
 
 
 def random_view(

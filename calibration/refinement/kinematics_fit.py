@@ -136,9 +136,7 @@ class KinematicsFit:
     def corrected_stack(self) -> Array:
         """Return the arm's link transforms (n, 4, 4) with the errors found: m, rad."""
         errors = self.errors.errors(self.u)
-        return np.array(
-            [X @ pose(exp_rotation(e[:3]), e[3:]) for X, e in zip(self.errors.arm.stack, errors, strict=True)]
-        )
+        return np.asarray(self.errors.arm.stack @ pose(exp_rotation(errors[:, :3]), errors[:, 3:]))
 
     def applied(self, observations: Sequence[Observation], q: Array) -> list[Observation]:
         """Observations with corrected centres and normals and with the poses that the corrected arm reaches."""
