@@ -173,10 +173,6 @@ class DocumentSection:
         """Return the mapping under a key; empty where there is none."""
         return DocumentSection.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
 
-    def sections(self, key: str) -> tuple["DocumentSection", ...]:
-        """Return the mappings of the list under a key; none where there is none."""
-        return tuple(DocumentSection.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
-
     def items(self, key: str) -> list[Any]:
         """Return the list under a key; empty where there is none."""
         value = self.values[key] if self.has(key) else []
@@ -212,19 +208,16 @@ class DocumentSection:
             raise self.wrong(key, "a text")
         return str(self.values[key])
 
-    def yes(self, key: str) -> bool:
-        """Return the true or false under a key."""
-        value = self.values.get(key)
-        if not isinstance(value, bool):
-            raise self.wrong(key, "true or false")
-        return value
-
     def texts(self, key: str) -> tuple[str, ...]:
         """Return the texts of the list under a key."""
         found = self.items(key)
         if not all(isinstance(v, str) for v in found):
             raise self.wrong(key, "a list of texts")
         return tuple(found)
+
+    def records(self, key: str, kind: type["Part"]) -> tuple["Part", ...]:
+        """Return the records of the list under a key; none where there is none. Raises InputError as read_part."""
+        return tuple(read_part(kind, v, self.file, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
 
     def numbers(self, key: str) -> dict[str, float | None]:
         """Return the numbers under the keys of the mapping under a key; null stays None."""
@@ -307,6 +300,9 @@ def read_part(kind: type[Part], document: Any, file: str, place: str = "") -> Pa
             near = nearest(str(key), types_, 0.5)
             hint = f"did you mean {near}?" if near else f"known are {', '.join(types_)}."
             raise InputError(f"'{file}': {_dotted(place, str(key))} is not a known key: {hint}")
+    for field_ in dc.fields(kind):  # type: ignore[arg-type]
+        if field_.name not in document and field_.default is field_.default_factory is dc.MISSING:
+            raise InputError(f"'{file}': {_dotted(place, field_.name)} is missing.")
     read: Any = {key: _value(types_[key], value, file, _dotted(place, key)) for key, value in document.items()}
     return kind(**read)
 
@@ -322,10 +318,10 @@ def _value(kind: Any, value: Any, file: str, key: str) -> Any:
         (kind,) = (k for k in get_args(kind) if k is not types.NoneType)
     if dc.is_dataclass(kind) and isinstance(kind, type):
         return read_part(kind, value, file, key)
-    if get_origin(kind) is list:
+    if get_origin(kind) is list or (get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis):
         if not isinstance(value, list):
             raise InputError(f"'{file}': {key} must be a list, not {shown(value)}.")
-        return [_value(get_args(kind)[0], item, file, f"{key}[{i}]") for i, item in enumerate(value)]
+        return get_origin(kind)(_value(get_args(kind)[0], v, file, f"{key}[{i}]") for i, v in enumerate(value))
     if get_origin(kind) is tuple:
         numbers = [as_number(v) for v in value] if isinstance(value, list) else []
         if len(numbers) != len(get_args(kind)) or not all(math.isfinite(v) for v in numbers):
@@ -334,6 +330,10 @@ def _value(kind: Any, value: Any, file: str, key: str) -> Any:
     if kind is str:
         if not isinstance(value, str):
             raise InputError(f"'{file}': {key} must be a text, not {shown(value)}.")
+        return value
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise InputError(f"'{file}': {key} must be true or false, not {shown(value)}.")
         return value
     number = as_number(value)
     if not math.isfinite(number) or (kind is int and number != int(number)):

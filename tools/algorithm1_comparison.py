@@ -139,11 +139,12 @@ def compare_algorithm1(found: RecordedFlange) -> tuple[Algorithm1Outcome | None,
 def _icp_record(held: Observation, X_BC: RigidTransform, verification: Verification) -> IcpRecord:
     """Return the published figure for our own calibration, made without the verification pose."""
     error = icp_error(X_BC, verification)
+    (a, b, c), (x, y, z) = np.degrees(error.value[:3]).tolist(), (1e3 * error.value[3:]).tolist()
     return IcpRecord(
         id=held.id,
         method=verification.method,
-        rotation_deg=tuple(float(v) for v in np.degrees(error.value[:3])),
-        translation_mm=tuple(float(v) for v in 1e3 * error.value[3:]),
+        rotation_deg=(a, b, c),
+        translation_mm=(x, y, z),
         translation_norm_mm=float(1e3 * np.linalg.norm(error.value[3:])),
         unseen=sight(X_BC, verification).unseen,
         true_error_mm=float(1e3 * position_errors(X_BC, [held])[0]),

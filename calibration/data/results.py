@@ -4,7 +4,7 @@ import json
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from weldcal.calibration.data.scanner_correction import (
 )
 from weldcal.calibration.geometry.se3 import as_transform, rotation_vector
 from weldcal.models.arrays import Array
-from weldcal.models.documents import DocumentSection, read_document, shown
+from weldcal.models.documents import DocumentSection, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole, write_atomic
 
@@ -92,8 +92,8 @@ class IcpRecord:
 
     id: str
     method: str
-    rotation_deg: tuple[float, ...]
-    translation_mm: tuple[float, ...]
+    rotation_deg: tuple[float, float, float]
+    translation_mm: tuple[float, float, float]
     translation_norm_mm: float
     unseen: tuple[str, ...]
     true_error_mm: float | None = None
@@ -307,8 +307,8 @@ def load_result(path: Path) -> CalibrationResult:
         covariance=covariance,
         held_out_mm={k: float("nan") if v is None else v for k, v in d.numbers("held_out_mm").items()},
         tilt_deg=d.numbers("tilt_deg"),
-        poses=tuple(_pose_record(r) for r in d.sections("poses")),
-        icp=tuple(_icp_record(r) for r in d.sections("icp")),
+        poses=d.records("poses", PoseRecord),
+        icp=d.records("icp", IcpRecord),
         unobservable=d.texts("unobservable"),
         warnings=d.texts("warnings"),
         robot=d.text("robot"),
@@ -347,41 +347,6 @@ def _covariance(d: DocumentSection, key: str, size: int) -> Array:
             f"'{d.file}': {key}.matrix is no covariance (not symmetric, or not positive); the file was changed by hand."
         )
     return C
-
-
-def _pose_record(r: DocumentSection) -> PoseRecord:
-    _only(r, PoseRecord)
-    return PoseRecord(
-        id=r.text("id"),
-        used=r.yes("used"),
-        reason=r.text("reason"),
-        residual_mm=r.optional("residual_mm"),
-        held_out_mm=r.optional("held_out_mm"),
-        tilt_deg=r.optional("tilt_deg"),
-        held_out_tilt_deg=r.optional("held_out_tilt_deg"),
-    )
-
-
-def _icp_record(r: DocumentSection) -> IcpRecord:
-    _only(r, IcpRecord)
-    rotation, translation = (tuple(float(v) for v in r.array(key, 3)) for key in ("rotation_deg", "translation_mm"))
-    return IcpRecord(
-        id=r.text("id"),
-        method=r.text("method"),
-        rotation_deg=rotation,
-        translation_mm=translation,
-        translation_norm_mm=r.number("translation_norm_mm", low=0.0),
-        unseen=r.texts("unseen"),
-        true_error_mm=r.optional("true_error_mm"),
-    )
-
-
-def _only(r: DocumentSection, kind: type) -> None:
-    """Refuses keys that a record does not have."""
-    known = {f.name for f in fields(kind)}
-    surplus = next((k for k in r.values if k not in known), None)
-    if surplus is not None:
-        raise InputError(f"'{r.file}': {r.place} has the unknown key {shown(surplus)}.")
 
 
 def export_urdf(

@@ -1,14 +1,13 @@
 """What a calibration found of the scanner: the factor over the image that corrects its points, and its clock."""
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.models.documents import as_number
+from weldcal.models.documents import read_part
 from weldcal.models.errors import InputError
 
 EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
@@ -189,7 +188,6 @@ def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
 
 
 ARRIVAL, DEVICE = "arrival", "device"
-_NUMBERS = ("offset_s", "sigma_s", "jitter_s", "reference_s", "drift", "drift_sigma", "rolling_s", "rolling_sigma_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,22 +236,7 @@ def clock_from_document(value: Any, file: str) -> ScannerClock | None:
     """Return the clock of a calibration.yaml; None without one. Raises InputError naming the key."""
     if value is None:
         return None
-    if not isinstance(value, Mapping) or value.get("kind") not in (ARRIVAL, DEVICE):
+    found = read_part(ScannerClock, value, file, "clock")
+    if found.kind not in (ARRIVAL, DEVICE):
         raise InputError(f"'{file}': clock.kind must be {ARRIVAL} or {DEVICE}; the file was changed by hand.")
-    numbers: dict[str, float | None] = {}
-    for key in _NUMBERS:
-        number = None if value.get(key) is None else as_number(value[key])
-        if number is not None and not math.isfinite(number):
-            raise InputError(f"'{file}': clock.{key} must be a finite number; the file was changed by hand.")
-        numbers[key] = number
-    reference = numbers.pop("reference_s")
-    late = value.get("late") or []
-    if not isinstance(late, list) or not all(isinstance(id, str) for id in late):
-        raise InputError(f"'{file}': clock.late must be a list of ids; the file was changed by hand.")
-    return ScannerClock(
-        kind=str(value["kind"]),
-        reference_s=reference or 0.0,
-        late=tuple(late),
-        reason=str(value.get("reason", "")),
-        **numbers,
-    )
+    return found

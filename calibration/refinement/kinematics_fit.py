@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.linalg import block_diag
 
-from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, plain
+from weldcal.calibration.adjustment import Kind, Observed, Unknowns, adjust, helmert, most_informative, plain
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
@@ -27,10 +27,7 @@ _LEAST_ORDER = 2  # the arm's errors must not stand in for bends that a plain ca
 _PARTS = ("turn x", "turn y", "offset", "shift x", "shift y", "shift z")
 
 _POSITION_M, _NORMAL_RAD = 1e-4, 1e-3  # what arms and scanners leave of a scan
-_POSE_SIGMA, _FACTOR_SIGMA = (
-    10.0,
-    0.1,
-)  # of X_BC (rad, m) and the scanner's factors before any scan: next to nothing is known
+_BEFORE = 0.1  # of X_BC (rad, m) and the scanner's factors before any scan: next to nothing is known
 
 
 @dataclass(frozen=True)
@@ -390,15 +387,10 @@ def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: 
     wanted = np.einsum("nij,nik->jk", J[:, :3], J[:, :3])
     J = J / np.repeat([_POSITION_M, _NORMAL_RAD], 3)[:, None]
     terms = J.shape[2] - 6 - k
-    V = np.diag(np.concatenate([np.full(6, _POSE_SIGMA**2), np.full(terms, _FACTOR_SIGMA**2), np.ones(k)]))
-    chosen: list[int] = []
-    for _ in range(min(n, len(q))):
-        JV = J @ V
-        own = np.linalg.inv(np.eye(6) + JV @ np.swapaxes(J, 1, 2))
-        gain = np.einsum("nij,nji->n", own, JV @ wanted @ np.swapaxes(JV, 1, 2))
-        gain[chosen] = -np.inf
-        best = int(np.argmax(gain))
-        chosen.append(best)
-        V = V - JV[best].T @ own[best] @ JV[best]
-        V = 0.5 * (V + V.T)
-    return np.array(chosen)
+    sigma = np.concatenate([np.full(6 + terms, _BEFORE), np.ones(k)])
+    J, wanted = J * sigma, wanted * np.outer(sigma, sigma)  # unit priors; a covariance that is taken down loses digits
+
+    def known(information: Array) -> Array:
+        return -np.asarray(np.trace(np.linalg.solve(information, wanted), axis1=-2, axis2=-1))
+
+    return np.array(most_informative(np.eye(len(sigma)), np.swapaxes(J, 1, 2) @ J, min(n, len(q)), known)[0])

@@ -249,7 +249,7 @@ def check_order(scenario: Scenario) -> None:
         InputError: an invalid value, or a limit of something that nothing measures or states.
     """
     welding = scenario.welding
-    process, limits, schedule = welding.process.process(), welding.order.limits, welding.schedule
+    process, limits, schedule = dc.replace(welding.process), welding.order.limits, welding.schedule
     welding.order.check()
     stated = {process.current_A is not None} | {bool(schedule and schedule.current_A and schedule.voltage_V)}
     for name in ("heat_input_kJ_mm", "current_A", "voltage_V"):
@@ -442,7 +442,7 @@ def check_scenario(scenario: Scenario) -> None:
     check_angles_order(scenario)
     if scenario.welding.stitch is not None:
         scenario.welding.stitch.stitch().check(1e-3 * scenario.welding.speed_mm_s)
-    scenario.planning.planning_method()
+    dc.replace(scenario.planning)
     check_range("job.speed_factor", scenario.job.speed_factor, SLOWEST_FACTOR, 1.0)
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):

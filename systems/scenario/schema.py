@@ -1,7 +1,9 @@
 """The schema of a scenario YAML: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
+import inspect
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,16 +17,33 @@ from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.passes.felt import WeldPass
-from weldcal.welding.passes.stitch import StitchConfig, StitchError
+from weldcal.welding.passes.stitch import StitchConfig
 from weldcal.welding.record.order import WeldOrder
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.schedule import WeldSchedule
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError
 
 JobConfigOf = TypeVar("JobConfigOf")
+Order = TypeVar("Order")
+SI = {"_mm_s": ("_m_s", 1e-3), "_mm": ("_m", 1e-3), "_deg": ("_rad", math.pi / 180.0)}
+"""Of a key's unit: that of the setting, and the factor."""
 LONGEST_STAND_S = 10.0  # a choice: an arc that stands for longer burns through
 FILE = {"file": True}
 """Metadata of a key that names a file: a relative path is looked for beside the scenario first."""
+
+
+def in_si(order: object, kind: Callable[..., Order], **others: float) -> Order:
+    """Return the settings of an order's keys of the same names, in SI units, with ``others`` beside them.
+
+    Raises what ``kind`` raises for invalid ones.
+    """
+    known, found = inspect.signature(kind).parameters, dict(others)
+    for name, value in vars(order).items():
+        unit = next((u for u in SI if name.endswith(u)), "")
+        si, factor = SI.get(unit, ("", 1.0))
+        if (key := name.removesuffix(unit) + si) in known:
+            found[key] = factor * value if unit and value is not None else value
+    return kind(**found)
 
 
 @dc.dataclass
@@ -148,21 +167,6 @@ class ObstacleConfig:
     margin_m: float = 0.02  # how far the arm keeps away
 
 
-@dc.dataclass
-class ProcessConfig:
-    """The arc settings of the power source, for the weld log; missing values stay empty."""
-
-    name: str | None = None  # MAG, MIG, FCAW, MMA, SAW, TIG or plasma
-    current_A: float | None = None
-    voltage_V: float | None = None
-    efficiency: float | None = None  # thermal efficiency k; default: the value of the process in EN 1011-1
-    wire_feed_m_min: float | None = None
-
-    def process(self) -> WeldProcess:
-        """The settings as a WeldProcess; raises WeldProcessError for invalid ones."""
-        return WeldProcess(self.name, self.current_A, self.voltage_V, self.efficiency, self.wire_feed_m_min)
-
-
 @dc.dataclass(kw_only=True)
 class WeaveOrder:
     """The weave: the torch swings across the seam while the tip keeps its path."""
@@ -180,15 +184,7 @@ class WeaveOrder:
         dwell = self.dwell_s if isinstance(self.dwell_s, list) else [float(self.dwell_s)]
         if len(dwell) not in (1, 2):
             raise WeaveError(f"welding.weave.dwell_s must hold one number or two, not {len(dwell)}.")
-        return WeaveConfig(
-            shape=self.shape,
-            amplitude_m=1e-3 * self.amplitude_mm,
-            frequency_hz=self.frequency_hz,
-            dwell_left_s=dwell[0],
-            dwell_right_s=dwell[-1],
-            bow_m=None if self.bow_mm is None else 1e-3 * self.bow_mm,
-            plane_rad=math.radians(self.plane_deg),
-        )
+        return in_si(self, WeaveConfig, dwell_left_s=dwell[0], dwell_right_s=dwell[-1])
 
 
 @dc.dataclass
@@ -204,10 +200,7 @@ class StitchOrder:
 
     def stitch(self) -> StitchConfig:
         """The order as a StitchConfig."""
-        if self.order not in ("along", "middle_out"):
-            raise StitchError(f"welding.stitch.order must be along or middle_out, not '{self.order}'.")
-        on_m, off_m, from_m = 1e-3 * self.on_mm, 1e-3 * self.off_mm, 1e-3 * self.from_mm
-        return StitchConfig(on_m, off_m, from_m, self.order == "middle_out")
+        return in_si(self, StitchConfig)
 
 
 @dc.dataclass(kw_only=True)
@@ -224,15 +217,7 @@ class PassOrder:
 
     def weld_pass(self) -> WeldPass:
         """The order as a WeldPass."""
-        return WeldPass(
-            lateral_m=1e-3 * self.lateral_mm,
-            vertical_m=1e-3 * self.vertical_mm,
-            angle_rad=math.radians(self.angle_deg),
-            travel_rad=None if self.travel_angle_deg is None else math.radians(self.travel_angle_deg),
-            speed_m_s=None if self.speed_mm_s is None else 1e-3 * self.speed_mm_s,
-            reverse=self.reverse,
-            interpass_s=self.interpass_s,
-        )
+        return in_si(self, WeldPass)
 
 
 @dc.dataclass(kw_only=True)
@@ -273,20 +258,12 @@ class ArcConfig:
 
 
 @dc.dataclass
-class PlanningConfig:
+class PlanningConfig(PlanningMethod):
     """The method of planning the seam from the workpiece's scan."""
 
-    method: str = "cad"  # cad: the CAD is registered to the scan; cloud: the groove is found in the scan without CAD
-    search: str = "guess"  # search for the CAD: guess, near workpiece.pose_guess; anywhere, in the whole scan
     # joints from which a scanner on the flange scans the part, six angles each; one plan is made from all scans; empty:
     # from home
     scan_poses_deg: list[list[float]] = dc.field(default_factory=list)
-    start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
-
-    def planning_method(self) -> PlanningMethod:
-        """The settings as a PlanningMethod; raises InputError for unknown values."""
-        x_y_z = None if self.start_m is None else (self.start_m[0], self.start_m[1], self.start_m[2])
-        return PlanningMethod(self.method, self.search, x_y_z)
 
 
 @dc.dataclass(kw_only=True)
@@ -298,7 +275,7 @@ class WeldingConfig:
     axial_deflection_mm: float | None = None  # null: 3, more in a wide joint
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
-    process: ProcessConfig = dc.field(default_factory=ProcessConfig)
+    process: WeldProcess = dc.field(default_factory=WeldProcess)
     arc: ArcConfig = dc.field(default_factory=ArcConfig)
     schedule: WeldSchedule | None = None  # null: no set values; the power source is set by hand
     order: WeldOrder = dc.field(default_factory=WeldOrder)

@@ -8,6 +8,7 @@ import os
 import time
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -181,6 +182,30 @@ def test_a_document_without_end_or_with_two_answers_is_refused(text: str, kind: 
     assert not Path("executed").exists()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A record of a file."""
+
+    id: str
+    used: bool
+    axes: tuple[int, ...] = ()
+
+
+def test_records_are_read_by_their_fields() -> None:
+    d = DocumentSection.of("f.yaml", {"a": [{"id": "p", "used": False, "axes": [1, 2]}], "b": [{"id": "p"}]})
+    assert d.records("a", Part) == (Part(id="p", used=False, axes=(1, 2)),)
+    assert d.records("none", Part) == ()
+    for wrong, sentence in (
+        ({"id": "p"}, r"b\[0\]\.used is missing"),
+        ({"id": 1, "used": True}, r"b\[0\]\.id must be a text"),
+        ({"id": "p", "used": 1}, r"b\[0\]\.used must be true or false"),
+        ({"id": "p", "used": True, "axes": [1, 0.5]}, r"b\[0\]\.axes\[1\] must be a whole number"),
+        ({"id": "p", "used": True, "axis": []}, r"b\[0\]\.axis is not a known key: did you mean axes"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            DocumentSection.of("f.yaml", {"b": [wrong]}).records("b", Part)
+
+
 def test_a_value_of_the_wrong_kind_is_named_with_file_and_key() -> None:
     d = DocumentSection.of("f.yaml", {"a": {"n": "x", "big": 10**400, "list": [1, [2]], "yes": 1}, "s": [1]})
     a = d.section("a")
@@ -188,9 +213,8 @@ def test_a_value_of_the_wrong_kind_is_named_with_file_and_key() -> None:
         (lambda: a.number("n"), "a.n must be a finite number"),
         (lambda: a.number("big"), "a.big must be a finite number"),
         (lambda: a.array("list", 2), "a.list must be 2 finite numbers"),
-        (lambda: a.yes("yes"), "a.yes must be true or false"),
         (lambda: d.texts("s"), "s must be a list of texts"),
-        (lambda: d.sections("s"), r"s\[0\] must be a mapping"),
+        (lambda: d.records("s", Part), r"s\[0\] must hold keys and values"),
         (lambda: d.section("s"), "s must be a mapping"),
     ):
         with pytest.raises(InputError, match=f"'f.yaml': {key}"):

@@ -54,7 +54,7 @@ def test_a_part_is_looked_for_in_a_frame_whose_z_is_up() -> None:
     points = rng.normal(size=(50, 3))
 
     def plan(points_U: Any, part: Any, X_UP: RigidTransform, method: PlanningMethod, eye_U: Any) -> RootPlan:
-        seen.update(points=points_U, X_UP=X_UP, start=method.start_B, eye=eye_U)
+        seen.update(points=points_U, X_UP=X_UP, start=method.start_m, eye=eye_U)
         return RootPlan(
             root=points_U[:5],
             up=np.tile([0.0, 0.0, 1.0], (5, 1)),
@@ -66,12 +66,12 @@ def test_a_part_is_looked_for_in_a_frame_whose_z_is_up() -> None:
             summary="",
         )
 
-    method = PlanningMethod(start_B=(0.1, 0.2, 0.3))
+    method = PlanningMethod(start_m=[0.1, 0.2, 0.3])
     part, eye = make_workpiece("straight"), np.array([0.5, 0.5, 0.5])
     found = plan_root_anyhow(points, part, X_BP, method, eye, up, plan)
     assert seen["points"][:, 2] == pytest.approx(points @ up)  # heights against gravity
     assert seen["eye"][2] == pytest.approx(eye @ up)
-    assert seen["start"][2] == pytest.approx(np.array(method.start_B) @ up)
+    assert seen["start"][2] == pytest.approx(np.array(method.start_m) @ up)
     assert found.root == pytest.approx(points[:5])
     assert found.up == pytest.approx(np.tile(up, (5, 1)))
     assert found.X_BP is not None

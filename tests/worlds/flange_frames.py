@@ -286,9 +286,10 @@ def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[Sphe
     X_BC = RigidTransform(RollPitchYaw(np.radians([180.0, 0.0, -90.0])), [-0.65, 0.1, 1.25])
     p_FS = P_FS + _MOUNTED_M * rng.normal(size=3)
     scans: list[SphereScan] = []
-    for _ in range(6 * n):
+    for count in range(6 * n):
         if len(scans) == n:
             break
+        rng = np.random.default_rng([seed, count])  # each its own: rays at edges differ between processors
         z = rng.uniform(0.58, 0.85)
         p = np.array([rng.uniform(-0.16, 0.16), rng.uniform(-0.12, 0.12), z])
         X_CF = facing(p, np.radians(rng.uniform(0.0, 25.0)), *rng.uniform(0.0, 2.0 * np.pi, 2))

@@ -243,7 +243,7 @@ def weld_record(
 ) -> WeldRecord:
     """The weld record of the run of this number from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
-    process = cell.scenario.welding.process.process()
+    process = cell.scenario.welding.process
     speed = travel_speed = speed_along(log.time, log.p_BW)
     if config.weave.amplitude_m:  # metal is deposited along the seam, not along the swings
         travel_speed = speed_along(log.time, np.outer(log.telemetry["s_torch"], [1.0, 0.0, 0.0]))

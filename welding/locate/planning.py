@@ -1,7 +1,5 @@
 """Plans root and tip path from scans: by the drawing registered to them, or from the cloud alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -34,20 +32,16 @@ OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring'
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
-@dataclass(frozen=True)
+@dataclass
 class PlanningMethod:
-    """Method and search of the seam plan.
+    """Method and search of the seam plan. A part from a file is always searched anywhere.
 
-    Attributes:
-        method: cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing.
-        search: of a plate's drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns
-            apart). A part from a file is always searched anywhere.
-        start_B: (x, y, z) m: a cloud's seam starts at its end nearest to this; without it nearest to the robot's base.
+    Raises InputError for unknown ones.
     """
 
-    method: str = "cad"
-    search: str = "guess"
-    start_B: tuple[float, float, float] | None = None
+    method: str = "cad"  # cad: the CAD is registered to the scan; cloud: the groove is found in the scan without CAD
+    search: str = "guess"  # search for the CAD: guess, near workpiece.pose_guess; anywhere, in the whole scan
+    start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -94,8 +88,8 @@ def locate_part(
     eye_B: npt.ArrayLike | None = None,
     *,
     X_BP_hint: RigidTransform | None = None,
-    config: PartConfig | None = None,
-) -> tuple[PartRegistration, MeasuredJoint]:
+    config: "PartConfig | None" = None,
+) -> "tuple[PartRegistration, MeasuredJoint]":
     """The pose of a part, and its joint in the part's frame as the scan shows it; see register_part and measure_joint.
 
     Raises:
@@ -190,7 +184,7 @@ def plan_root(
     if method.method == "cloud":
         from weldcal.welding.locate.groove.extract import extract_groove
 
-        groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
+        groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_m)
         return RootPlan(
             root=groove.curve.position(np.linspace(0.0, groove.curve.length, len(groove.curve.knots))),
             up=groove.curve.ups,
@@ -246,9 +240,9 @@ def plan_root_anyhow(
         return plan(points_B, workpiece, X_BP_guess, method, eye_B)
     R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
     X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
-    if method.start_B is not None:
-        x, y, z = X_UB @ np.array(method.start_B)
-        method = replace(method, start_B=(x, y, z))
+    if method.start_m is not None:
+        x, y, z = X_UB @ np.array(method.start_m)
+        method = replace(method, start_m=[x, y, z])
     R_UB = X_UB.rotation().matrix()
     turned = [p @ R_UB.T for p in points_B] if isinstance(points_B, list) else points_B @ R_UB.T
     found = plan(turned, workpiece, X_UB @ X_BP_guess, method, eye_B @ R_UB.T)

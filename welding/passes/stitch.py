@@ -29,15 +29,22 @@ class StitchConfig:
     Attributes:
         on_m, off_m: length of a piece, and of the pause after it.
         from_m: where the first piece starts.
-        middle_out: the piece in the middle is welded first, then one on either side by turns.
+        order: along, or middle_out: the piece in the middle is welded first, then one on either side by turns.
     """
 
     on_m: float = 0.0
     off_m: float = 0.0
     from_m: float = 0.0
-    middle_out: bool = False
+    order: str = "along"
+
+    @property
+    def middle_out(self) -> bool:
+        """Whether the piece in the middle is welded first."""
+        return self.order == "middle_out"
 
     def __post_init__(self) -> None:
+        if self.order not in ("along", "middle_out"):
+            raise StitchError(f"welding.stitch.order must be along or middle_out, not '{self.order}'.")
         if not all(math.isfinite(v) and v >= 0.0 for v in (self.on_m, self.off_m, self.from_m)):
             raise StitchError("A stitch needs lengths of zero or more.")
         if (self.on_m > 0.0) != (self.off_m > 0.0):

@@ -26,23 +26,21 @@ class WeldProcessError(InputError):
     """A welding process with invalid values."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class WeldProcess:
-    """Nominal values of the arc as set at the power source, not measured; None means unknown.
+    """The arc settings of the power source, for the weld log; missing values stay empty.
 
     Attributes:
-        name: a key of EFFICIENCY; current_A, voltage_V: both or neither.
-        efficiency: thermal efficiency k, 0 to 1; None takes the process's from EFFICIENCY.
-        wire_feed_m_min: for the record.
+        current_A, voltage_V: both or neither.
 
     Raises:
         WeldProcessError: unknown process, a number that is not positive, or half of what a heat input needs.
     """
 
-    name: str | None = None
+    name: str | None = None  # MAG, MIG, FCAW, MMA, SAW, TIG or plasma
     current_A: float | None = None
     voltage_V: float | None = None
-    efficiency: float | None = None
+    efficiency: float | None = None  # thermal efficiency k; default: the value of the process in EN 1011-1
     wire_feed_m_min: float | None = None
 
     def __post_init__(self) -> None:

@@ -333,7 +333,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         q_near=np.deg2rad(scenario.home_deg),
         clearance_m=welding.clearance_mm * 1e-3,
         seam_length_m=None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
-        method=scenario.planning.planning_method(),
+        method=scenario.planning,
         surroundings=station.surroundings,
         table_z_m=scenario.table_height_m(),
         lean_rad=np.deg2rad(welding.lean_deg),

@@ -170,16 +170,16 @@ def test_a_missing_result_says_what_to_give(tmp_path: Path) -> None:
     ("old", "new", "sentence"),
     [
         ("used: true", "used: maybe", r"poses\[0\]\.used must be true or false, not 'maybe'"),
-        ("residual_mm: 0.1", "residual_mm: [0.1]", r"poses\[0\]\.residual_mm must be a finite number"),
-        ("residual_mm: 0.1", "residuum_mm: 0.1", r"poses\[0\] has the unknown key 'residuum_mm'"),
+        ("residual_mm: 0.1", "residual_mm: [0.1]", r"poses\[0\]\.residual_mm must be a number"),
+        (
+            "residual_mm: 0.1",
+            "residuum_mm: 0.1",
+            r"poses\[0\]\.residuum_mm is not a known key: did you mean residual_mm",
+        ),
         ("held_out_mm: {", "held_out_mm: {worst: big, ", r"held_out_mm\.worst must be a finite number, not 'big'"),
         ("seed: 7", "seed: -1", "seed must be a finite number, 0 or more, not '-1'"),
         ("seed: 7", "seed: 1.5", "seed must be a whole number"),
-        (
-            "rotation_deg: [0.0, 0.1, 0.2]",
-            "rotation_deg: [0.0, 0.1]",
-            r"icp\[0\]\.rotation_deg must be 3 finite numbers",
-        ),
+        ("rotation_deg: [0.0, 0.1, 0.2]", "rotation_deg: [0.0, 0.1]", r"icp\[0\]\.rotation_deg must be 3 numbers"),
         ("warnings: [one]", "warnings: one", "warnings must be a list, not 'one'"),
         ("sigma_position_mm: 0.0", "sigma_position_mm: .nan", "sigma_position_mm must be a finite number"),
         ("axis_turn_deg: null", "axis_turn_deg: [1.0]", "axis_turn_deg must be 2 finite numbers"),

@@ -111,6 +111,8 @@ def test_informative_poses_know_more_than_the_first_ones() -> None:
     X_BC, _ = _near(world)
     chosen = informative_poses(ARM, X_BC, world.q, 15)
     assert len(set(chosen.tolist())) == 15
+    rounded = world.q * (1.0 + 1e-14 * np.random.default_rng(1).normal(size=world.q.shape))
+    assert informative_poses(ARM, X_BC, rounded, 15).tolist() == chosen.tolist()  # another processor chooses the same
     spread = []
     for rows in (chosen, np.arange(15)):
         scans = [world.observations[i] for i in rows]

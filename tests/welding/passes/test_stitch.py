@@ -74,7 +74,7 @@ def test_a_stitch_whose_torch_is_off_the_seam_is_a_fault() -> None:
 def test_from_the_middle_outwards_no_side_is_ahead_by_more_than_a_piece(length: float) -> None:
     along = StitchConfig(on_m=0.03, off_m=0.045, from_m=0.005).pieces(length)
     assert along == sorted(along)
-    ordered = StitchConfig(on_m=0.03, off_m=0.045, from_m=0.005, middle_out=True).pieces(length)
+    ordered = StitchConfig(on_m=0.03, off_m=0.045, from_m=0.005, order="middle_out").pieces(length)
     assert sorted(ordered) == along, "the same pieces"
     middle = 0.5 * (along[0].start + along[-1].end) if along else 0.0
     pitch = 0.075

@@ -69,9 +69,9 @@ def test_a_process_that_cannot_be_is_refused_in_one_sentence(wrong: dict[str, fl
 
 def test_a_scenario_says_what_the_power_source_is_set_to() -> None:
     text = "welding: {process: {name: TIG, current_A: 90.0, voltage_V: 11.0, wire_feed_m_min: 1.5}}"
-    arc = load_scenario("s_groove", text).welding.process.process()
+    arc = load_scenario("s_groove", text).welding.process
     assert (arc.name, arc.current_A, arc.voltage_V, arc.k, arc.wire_feed_m_min) == ("TIG", 90.0, 11.0, 0.6, 1.5)
-    assert load_scenario("s_groove").welding.process.process() == WeldProcess(), "the shipped scenario knows of no arc"
+    assert load_scenario("s_groove").welding.process == WeldProcess(), "the shipped scenario knows of no arc"
     with pytest.raises(InputError, match="both current_A"):
         load_scenario("s_groove", "welding: {process: {name: TIG, current_A: 90.0}}")
 
