@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import Chain, link_frames
-from weldcal.models.arms.shape import arm_capsules
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
@@ -40,6 +39,8 @@ class LinkCapsule:
 
 def arm_bodies(arm: Chain, tool: Sequence[Capsule] = ()) -> list[LinkCapsule]:
     """Capsules of the arm's links and of a tool given in the flange frame."""
+    from weldcal.models.arms.shape import arm_capsules  # only here: a job that plans nothing needs no shapes
+
     bodies = [LinkCapsule(c.link_index, c.link_index, c.p_start, c.p_end, c.radius) for c in arm_capsules(arm)]
     return bodies + [LinkCapsule(arm.n + 1, arm.n, c.p_start, c.p_end, c.radius) for c in tool]
 
