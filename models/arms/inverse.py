@@ -29,11 +29,11 @@ _BEND = 1e-3
 _BENT = 5  # times that an arm is bent at most
 _HALF_REAL = 0.5  # rad: the imaginary part up to which a complex angle seeds Newton; a bend makes some of a pair of two
 _SHIFT_RAD = 0.3  # of the eliminated joint: its half turn, which tan cannot say, lies at no angle that people choose
-_HELD = 8  # angles of the third joint of a seven-axis arm: a choice
+_DRAWN, _DRAWN_STEPS = 40, 60  # starts of more than six joints, and their steps within the limits: a choice
 
 
 def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None = None) -> Array:
-    """Return all joint angles (k, n) rad that put the flange at X_BF, wrapped to (-pi, pi] and within the limits.
+    """Return all joint angles (k, n) rad that put the flange at X_BF, within the limits, and in (-pi, pi] where these allow it.
 
     Starts are the closed form of a UR on its nominal lengths, and the eigenvalues of `_loop_angles` of another arm.
     Newton steps on the arm's own kinematics then lower the residual below 1e-9 m and rad. ``near`` (n,) rad is one more
@@ -53,7 +53,7 @@ def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None 
     starts = np.empty((0, arm.n)) if near is None else stay[None]
     found: list[Array] = []
     for bends in _BENDS:
-        own = _branches(arm, R, p, _wrapped(stay)[5]) if isinstance(arm, ArmModel) else _starts(arm, goal, stay, bends)
+        own = _branches(arm, R, p, _wrapped(stay)[5]) if isinstance(arm, ArmModel) else _starts(arm, goal, bends)
         left = np.vstack([np.reshape(found, (-1, arm.n)), _wrapped(_polish(arm, R, p, np.vstack([own, starts])))])
         found = []
         while len(left):
@@ -62,6 +62,7 @@ def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None 
         if isinstance(arm, ArmModel) or arm.n != 6 or len(found) % 2 == 0:
             break  # the real solutions of six joints come in pairs: an odd one says that a singularity hides another
     q = np.reshape(found, (-1, arm.n))
+    q = q + 2.0 * np.pi * (1.0 * (q < arm.position_lower - _SAME_RAD) - (q > arm.position_upper + _SAME_RAD))
     q = q[np.all((q >= arm.position_lower - _SAME_RAD) & (q <= arm.position_upper + _SAME_RAD), axis=1)]
     return np.clip(q, arm.position_lower, arm.position_upper)
 
@@ -74,6 +75,8 @@ def why_unreached(arm: Chain, X_BF: RigidTransform) -> str:
     found = inverse_kinematics(replace(arm, position_lower=-whole, position_upper=whole), X_BF)
     if not len(found):
         return "no joint angles lead to the pose of the flange"
+    turned = found - 2.0 * np.pi * np.sign(found)
+    found = np.where((turned >= arm.position_lower) & (turned <= arm.position_upper), turned, found)
     outside = np.maximum(arm.position_lower - found, found - arm.position_upper)
     least = int(np.argmin(outside.max(axis=1)))
     joint = int(np.argmax(outside[least]))
@@ -121,22 +124,15 @@ def _beyond_m(arm: Chain, goal: Array) -> float:
     return float(np.linalg.norm(goal[:3, 3] - arm.stack[0, :3, 3]) - size)
 
 
-def _starts(arm: Chain, goal: Array, near: Array, bends: Array) -> Array:
-    """Joint angles (m, n) rad near all solutions of an arm: as of six joints, some held still or none of its own."""
-    n, pads = arm.n, _PADS[: max(6 - arm.n, 0)]
-    X_LF, stack = arm.X_LF, np.vstack([arm.stack, pads])
+def _starts(arm: Chain, goal: Array, bends: Array) -> Array:
+    """Joint angles (m, n) rad near all solutions of up to six joints, those missing put at its end; else drawn."""
+    if arm.n > 6:
+        low, high = np.maximum(arm.position_lower, -np.pi), np.minimum(arm.position_upper, np.pi)
+        return np.random.default_rng(0).uniform(low, high, (_DRAWN, arm.n))
+    pads, X_LF = _PADS[: 6 - arm.n], arm.X_LF
     for pad in pads[::-1]:
         X_LF = _inverse(pad) @ X_LF
-    if n <= 6:
-        return _six_joint_starts(stack, X_LF, goal, bends)[:, :n]
-    inner = slice(2, n - 4)
-    held = np.linspace(arm.position_lower[inner], arm.position_upper[inner], _HELD + 1)[1:]
-    starts = []
-    for angles in [near[inner], *held]:
-        link = joint_frames(stack[inner], angles)[-1] @ stack[n - 4]
-        six = _six_joint_starts(np.array([*stack[:2], link, *stack[n - 3 :]]), X_LF, goal, bends)
-        starts.append(np.hstack([six[:, :2], np.tile(angles, (len(six), 1)), six[:, 2:]]))
-    return np.vstack(starts)
+    return _six_joint_starts(np.vstack([arm.stack, pads]), X_LF, goal, bends)[:, : arm.n]
 
 
 def _six_joint_starts(stack: Array, X_LF: Array, goal: Array, bends: Array) -> Array:
@@ -214,7 +210,7 @@ def _polish(arm: Chain, R: Array, p: Array, starts: Array) -> Array:
     """Newton from joint angles (m, n) to the goal on the arm's own kinematics; those (k, n) that get there."""
     q, best, least = starts.copy(), starts.copy(), np.full(len(starts), np.inf)
     left = np.arange(len(q))
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_STEPS if arm.n <= 6 else _DRAWN_STEPS):
         R_now, p_now, J = kinematics_and_jacobian(arm, q[left])
         turn = R @ np.swapaxes(R_now, 1, 2)
         error = np.empty((len(left), 6, 1))
@@ -232,7 +228,10 @@ def _polish(arm: Chain, R: Array, p: Array, starts: Array) -> Array:
         damping = np.clip(residual[go_on] ** 2, _NO_DAMPING, _DAMPING)[:, None, None] * np.eye(6)
         J_T = np.swapaxes(J, 1, 2)
         step = (J_T @ np.linalg.solve(J @ J_T + damping, error[go_on]))[:, :, 0]
-        q[left] += step * np.minimum(1.0, _MAX_STEP_RAD / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
+        step *= np.minimum(1.0, _MAX_STEP_RAD / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
+        q[left] += step
+        if arm.n > 6:  # the others close the loop at any turn
+            q[left] = np.clip(q[left], arm.position_lower, arm.position_upper)
     return best[least < RESIDUAL]
 
 

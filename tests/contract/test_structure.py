@@ -15,7 +15,7 @@ from tests.places import ROOT
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
     "code lines of calibration": 30_216,
-    "code lines of models": 6_429,
+    "code lines of models": 6_428,
     "code lines of systems": 19_390,
     "code lines of tools": 22_977,
     "code lines of welding": 9_689,

@@ -255,6 +255,14 @@ def test_fewer_joints_are_found_from_all_sides(n: int) -> None:
         assert min(apart(q, other) for other in solutions) < 1e-6
 
 
+def test_limits_beyond_half_a_turn_are_used() -> None:
+    arm = replace(arm_by_table("xarm6"), position_lower=np.full(6, 0.5), position_upper=np.full(6, 0.5 + 2.0 * np.pi))
+    q = np.array([4.0, 1.2, 5.5, 3.5, 0.9, 6.0])
+    solutions = inverse_kinematics(arm, as_pose(pose_by_table("xarm6", q)))
+    assert np.abs(solutions - q).max(axis=1).min() < 1e-6
+    assert ((solutions >= 0.5) & (solutions <= 0.5 + 2.0 * np.pi)).all()
+
+
 def test_seven_joints_keep_to_the_angles_they_have() -> None:
     arm = load_chain("franka_panda")
     middle = 0.5 * (arm.position_lower + arm.position_upper)
@@ -264,8 +272,9 @@ def test_seven_joints_keep_to_the_angles_they_have() -> None:
         found = nearest_solution(arm, X_BF, q)
         assert found is not None
         np.testing.assert_allclose(found, q, rtol=0, atol=1e-6)
-        q[2] = arm.position_lower[2] + 0.625 * (arm.position_upper[2] - arm.position_lower[2])
+    for q in np.random.default_rng(5).uniform(arm.position_lower, arm.position_upper, (25, 7)):
         X_BF = forward_kinematics(arm, q)
-        others = inverse_kinematics(arm, X_BF)  # of eight angles of the third joint, this one the fifth
-        assert min(apart(q, one) for one in others) < 0.05
+        others = inverse_kinematics(arm, X_BF)
+        assert len(others) > 0
+        assert ((others >= arm.position_lower) & (others <= arm.position_upper)).all()
         assert all(forward_kinematics(arm, one).IsNearlyEqualTo(X_BF, 1e-8) for one in others)
