@@ -33,12 +33,12 @@ _DRAWN, _DRAWN_STEPS = 40, 60  # starts of more than six joints, and their steps
 
 
 def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None = None) -> Array:
-    """Return all joint angles (k, n) rad that put the flange at X_BF, within the limits, and in (-pi, pi] where these allow it.
+    """Return all joint angles (k, n) rad within the limits that put the flange at X_BF, in (-pi, pi] where possible.
 
     Starts are the closed form of a UR on its nominal lengths, and the eigenvalues of `_loop_angles` of another arm.
     Newton steps on the arm's own kinematics then lower the residual below 1e-9 m and rad. ``near`` (n,) rad is one more
     start. At a UR's wrist singularity (wrist 2 at 0 or pi) wrist 3 is put where it is in ``near``, else at zero. More
-    than six joints have whole families of solutions, of which some are returned. Empty where the pose is out of reach.
+    than six joints start from drawn angles: they have whole families of solutions, of which some are returned. Empty where the pose is out of reach.
 
     Raises:
         InputError: X_BF is not finite.
