@@ -38,8 +38,8 @@ def inverse_kinematics(arm: Chain, X_BF: RigidTransform, near: ArrayLike | None 
     Starts are the closed form of a UR on its nominal lengths, and the eigenvalues of `_loop_angles` of another arm.
     Newton steps on the arm's own kinematics then lower the residual below 1e-9 m and rad. ``near`` (n,) rad is one more
     start. At a UR's wrist singularity (wrist 2 at 0 or pi) wrist 3 is put where it is in ``near``, else at zero. More
-    than six joints start from drawn angles and have whole families of solutions, of which some are returned. Empty where
-    the pose is out of reach.
+    than six joints start from drawn angles and have whole families of solutions, of which some are returned. Empty
+    where the pose is out of reach.
 
     Raises:
         InputError: X_BF is not finite.
