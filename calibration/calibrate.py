@@ -28,7 +28,7 @@ from weldcal.models.errors import InputError
 
 if TYPE_CHECKING:
     from weldcal.calibration.refinement.local_field import LocalField
-    from weldcal.models.arms.chain import Chain
+    from weldcal.models.arms.kinematics import Chain
 
 REFINEMENTS = ("local", "joints", "links")
 PLAIN = "none"

@@ -31,7 +31,8 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, sol
 from weldcal.calibration.motion import pose_streams
 from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose, VisibleVolume, next_pose, view_of
-from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner

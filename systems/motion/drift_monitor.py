@@ -18,8 +18,7 @@ from weldcal.calibration.data.scanner_correction import (
 )
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest, drift_config
-from weldcal.models.arms.chain import chain_of, chain_poses
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import ArmModel, chain_poses
 from weldcal.models.arrays import Array
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
@@ -80,7 +79,7 @@ class Seen:
             return np.full((*times.shape, 3), np.nan)
         flat = times.ravel()
         joints = np.column_stack([np.interp(flat, t, q[:, k]) for k in range(q.shape[1])])
-        p = (chain_poses(chain_of(self.arm), joints) @ self.X_FR.GetAsMatrix4())[:, :3, 3]
+        p = (chain_poses(self.arm, joints) @ self.X_FR.GetAsMatrix4())[:, :3, 3]
         p[(flat < t[0]) | (flat > t[-1])] = np.nan
         return np.asarray(p.reshape(*times.shape, 3))
 

@@ -26,7 +26,8 @@ from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_datas
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.models.arms.chain import chain_inverse, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
@@ -64,7 +65,7 @@ def hand_moves(
         R_BC = Rotation.from_euler("zxy", [lean[0], np.pi + lean[1], lean[2]]).as_matrix()
         p = X_BT.translation() - rng.uniform(0.5, 0.62) * R_BC[:, 2] + spread_m * rng.uniform(-1.0, 1.0, 3)
         X_BF = RigidTransform(RotationMatrix(R_BC), p) @ X_FC.inverse()
-        found = chain_inverse(chain, X_BF, near)
+        found = nearest_solution(chain, X_BF, near)
         if found is not None:
             near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
             q.append(near)

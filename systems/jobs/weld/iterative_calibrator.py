@@ -14,7 +14,6 @@ from weldcal.calibration.eye_on_base.few_poses import ENOUGH
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import observation_from_fit
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
-from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -38,7 +37,7 @@ def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_
     steps = Steps(
         correct_scanner=correct_scanner,
         refine=kind,
-        arm=None if kind == "local" else chain_of(arm),
+        arm=None if kind == "local" else arm,
         joints=np.array(status.joints),
         note=f"{arm.name}, refined by a live calibration (calibration.refine: {kind})",
     )

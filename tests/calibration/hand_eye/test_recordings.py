@@ -18,7 +18,8 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
 from weldcal.calibration.verified_pairs import holds_scans
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import chain_poses
 from weldcal.models.arrays import Array
 from weldcal.tools.cli.app import app
 
