@@ -1,7 +1,8 @@
 """Reads point clouds from PLY, PCD, NPZ, NPY and text files and depth images; refuses damaged ones with a reason."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, decoded, read_text, write_npz
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
 __all__ = [
     "NO_NOTES",
@@ -46,8 +48,7 @@ NO_NOTES = tuple(
 )  # such a file beside the clouds is a cloud, not somebody's notes or pictures
 _MIN_POINTS = 30
 _ROWS = 50_000  # converted at a time
-_LINE = re.compile(r"[^\r\n]+")
-_COMMA_DECIMAL = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_ROWS_TO_SEPARATE = 50
 _WHOLE = re.compile(r"[+-]?\d+")
 _LONGEST_NUMBER = 100  # characters
 
@@ -181,45 +182,42 @@ def read_text_cloud(path: Path) -> Array:
     Raises:
         CloudError: anything else, with the line's number. InputError: the file cannot be opened, or is not UTF-8.
     """
-    rows = _rows(_text(path))
-    first = next(rows, None)
+    lines = lines_of(_text(path), ("#", "//"))
+    rows = ((number, row) for number, line in lines if (row := line.rstrip(",; \t")))
+    begin = list(islice(rows, _ROWS_TO_SEPARATE))
     promised = None
-    if first is not None and _WHOLE.fullmatch(first[1]) and len(first[1]) < 16:
-        promised, first = int(first[1]), next(rows, None)
-    if first is None:
+    if begin and _WHOLE.fullmatch(begin[0][1].strip()) and len(begin[0][1]) < 16:
+        promised = int(begin.pop(0)[1])
+    if not begin:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
-    line, row = first
-    separator = _separator(row)
-    header = [c.strip().lower() for c in _cells(row, separator)]
-    columns, width = [0, 1, 2], len(header)
-    pending: list[tuple[int, str]] = []
-    headed = _number(header[0], separator) is None
+    separator = separator_of([row for _, row in begin])
+    above = begin[0][1]
+    header = [c.lower() for c in cells_of(above, separator_of([above]))]
+    columns = [0, 1, 2]
+    headed = _number(header[0]) is None
     if headed:
+        del begin[0]
         if {"x", "y", "z"} <= set(header):
             columns = [header.index(c) for c in "xyz"]
         if any(header.count(c) > 1 for c in "xyz"):
             raise CloudError(f"The header of {path.name} names x, y or z twice; keep one.")
-        below = next(rows, None)
-        if below is None:
+        if not begin:
             raise CloudError(f"The cloud {path.name} is empty; scan again.")
-        pending.append(below)
-        if _separator(below[1]) != separator:  # a header of its own kind, such as "x y z" over "1,2,3"
-            separator = _separator(below[1])
-            width = len(_cells(below[1], separator))
-    else:
-        pending.append(first)
+    # a header of its own kind, such as "x y z" over "1,2,3", names no number of cells
+    own = headed and separator_of([above]) != separator
+    width = len(cells_of(begin[0][1], separator)) if own else len(header)
     if width < 3:
         raise CloudError(f"The file {path.name} has a row of fewer than three numbers; x, y and z are needed.")
     blocks: list[Array] = []
     block: list[list[float]] = []
     # a header that names as many columns as a row has cells says that commas separate them
     whole = separator == "," and not (headed and len(header) == width)
-    for line, row in _chain(pending, rows):
-        cells = _cells(row, separator)
+    for line, row in chain(begin, rows):
+        cells = cells_of(row, separator)
         if len(cells) != width:
             raise CloudError(_surplus(path, line, len(cells), width))
         whole = whole and _could_be_decimals(cells)
-        numbers = [_number(cells[c], separator) for c in columns]
+        numbers = [_number(cells[c]) for c in columns]
         if None in numbers:
             bad = next(cells[c] for c, v in zip(columns, numbers, strict=True) if v is None)
             raise CloudError(f"The file {path.name}, line {line}: '{bad[:40]}' is not a number.")
@@ -247,41 +245,7 @@ def _text(path: Path) -> str:
         return decoded(path, stream.read())
 
 
-def _rows(text: str) -> Iterator[tuple[int, str]]:
-    """Lines with a value, numbered from 1, without comments."""
-    number, at = 1, 0
-    for match in _LINE.finditer(text):
-        number += len(re.findall(r"\r\n|\r|\n", text[at : match.start()]))
-        at = match.start()
-        row = match.group().strip().rstrip(",;").strip()
-        if row and not row.startswith(("#", "//")):
-            yield number, row
-
-
-def _chain(first: list[tuple[int, str]], rest: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    yield from first
-    yield from rest
-
-
-def _separator(row: str) -> str:
-    """What separates the cells of a row; a blank for any number of blanks, tabs included."""
-    if ";" in row:
-        return ";"
-    if "\t" in row and len(row.split("\t")) > 2:
-        return "\t"
-    words = row.split()
-    if len(words) > 2 and not any(w.startswith(",") or w.endswith(",") for w in words):
-        return " "
-    return "," if "," in row else " "
-
-
-def _cells(row: str, separator: str) -> list[str]:
-    return row.split() if separator == " " else [cell.strip() for cell in row.split(separator)]
-
-
-def _number(cell: str, separator: str) -> float | None:
-    if "," in cell and separator != "," and _COMMA_DECIMAL.fullmatch(cell):
-        cell = cell.replace(",", ".")
+def _number(cell: str) -> float | None:
     if len(cell) > _LONGEST_NUMBER or "_" in cell:
         return None
     try:

@@ -19,11 +19,12 @@ from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.files import require_short_numbers
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
 _CELL = re.compile(rf"{NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _KEYED = re.compile(rf"[\"']?\b([A-Za-z_][\w.]{{0,40}})[\"']?\s{{0,9}}[:=]\s{{0,9}}[\"']?({NUMBER})(?![\w.])")
 _UNIT_CELL = re.compile(r"(?i)[\[(]?(mm|cm|m|in|inch|deg|rad|degrees?|radians?|°|-|s|ms)?[\])]?")
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+_BRACKETS = re.compile(r"[\[\](){}]")
 _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
@@ -85,7 +86,7 @@ def keyed_lists(text: str, name: str) -> list[Listing]:
 
     Empty where it has none.
     """
-    rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
+    rows = [found for _, line in lines_of(text) if len(found := _KEYED.findall(line)) >= 6]
     names = [key for key, _ in rows[0]] if len(rows) > 1 else []
     if not names or any([key for key, _ in row] != names for row in rows) or _named(names) < 5:
         return []
@@ -254,45 +255,21 @@ def _quaternion_rows(table: Array) -> bool:
 
 def _lines(text: str) -> tuple[list[_Line], list[_Line]]:
     """Return the lines of a table in cells, and its comments."""
-    plain = re.split(r"\r\n|\n|\r", text)
-    rows = [(k, s) for k, s in enumerate(plain, 1) if s.strip() and not s.lstrip().startswith(_COMMENT)]
-    comments = [
-        (k, s.lstrip().lstrip("#%/!;").strip()) for k, s in enumerate(plain, 1) if s.lstrip().startswith(_COMMENT)
-    ]
-    separator = _separator([s for _, s in rows])
+    rows = list(lines_of(text, _COMMENT))
+    comments = ((k, s.lstrip(" \t#%/!;")) for k, s in lines_of(text) if s.lstrip().startswith(_COMMENT))
+    separator = separator_of([_BRACKETS.sub(" ", s) for _, s in rows])
     lines = [_Line(k, _cells(s, separator)) for k, s in rows]
     return lines, [_Line(k, _cells(s, separator if separator in s else " ")) for k, s in comments if s]
 
 
-def _separator(rows: Sequence[str]) -> str:
-    sample = rows[: min(len(rows), 50)]
-    for mark in (";", "\t"):
-        if sample and sum(mark in s for s in sample) >= 0.8 * len(sample):
-            return mark
-    # commas between blanks are separators; a comma inside of every number is a decimal comma
-    if sample and all(
-        len(re.findall(r"\d,\d", s)) and "." not in s and len(s.split()) > 2 for s in sample[1:] or sample
-    ):
-        return " "
-    return "," if any("," in s for s in sample) else " "
-
-
 def _cells(line: str, separator: str) -> list[str]:
-    plain = re.sub(r"[\[\](){}]", " " if separator != "," else "", line) if separator in ", " else line
-    if separator == " ":
-        cells = plain.split()
-    elif separator == ",":
-        cells = [c.strip() for part in [plain] for c in part.split(",")]
-        # blanks may separate numbers, too
+    plain = _BRACKETS.sub(" " if separator == " " else "", line) if separator in ", " else line
+    cells = cells_of(plain, separator)
+    if separator == ",":  # blanks may separate numbers, too
         cells = [word for cell in cells for word in (cell.split() if _all_numbers(cell) else [cell])]
-    else:
-        cells = [c.strip() for c in plain.split(separator)]
     while len(cells) > 1 and cells[-1] == "":
         cells.pop()
-    cells = [c.strip().strip("\"'") for c in cells]
-    if separator != ",":
-        cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
-    return cells
+    return [c.strip("\"'") for c in cells]
 
 
 def _all_numbers(cell: str) -> bool:
