@@ -38,14 +38,6 @@ __all__ = [
     "save_cloud",
 ]
 
-_TEXT = (".csv", ".txt", ".xyz", ".pts", ".asc")
-_PLAIN = (".ply", ".pcd", ".npz", ".npy", *_TEXT)
-_PACKED = (".ply.gz", ".pcd.gz", *(f"{s}.gz" for s in _TEXT))
-SUFFIXES = (*_PLAIN, *_PACKED, *IMAGES)
-_NOTES = (".csv", ".txt", ".csv.gz", ".txt.gz", *IMAGES)
-NO_NOTES = tuple(
-    s for s in SUFFIXES if s not in _NOTES
-)  # such a file beside the clouds is a cloud, not somebody's notes or pictures
 _MIN_POINTS = 30
 _ROWS = 50_000  # converted at a time
 _ROWS_TO_SEPARATE = 50
@@ -56,7 +48,7 @@ _LONGEST_NUMBER = 100  # characters
 def ending_of(path: Path) -> str:
     """Return the ending of a cloud's file, one of SUFFIXES; the name's last one for another file."""
     name = path.name.lower()
-    return next((s for s in _PACKED if name.endswith(s)), path.suffix.lower())
+    return next((s for s in SUFFIXES if s.endswith(".gz") and name.endswith(s)), path.suffix.lower())
 
 
 def cloud_id(path: Path) -> str:
@@ -173,7 +165,7 @@ def _read_npz(path: Path, form: CloudForm) -> Array:
     return back_projected(depth, values)
 
 
-def read_text_cloud(path: Path) -> Array:
+def read_text_cloud(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
 
     A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal
@@ -283,11 +275,20 @@ def _read_pcd(path: Path, form: CloudForm) -> Array:
     return read_pcd(path, form)
 
 
+_TEXT = (".csv", ".txt", ".xyz", ".pts", ".asc")
 _READERS: dict[str, Callable[[Path, CloudForm], Array]] = {
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
     ".npz": _read_npz,
     ".npy": _read_npy,
-    **dict.fromkeys((".ply", ".ply.gz"), _read_ply),
-    **dict.fromkeys((".pcd", ".pcd.gz"), _read_pcd),
+    **dict.fromkeys(_TEXT, read_text_cloud),
+    ".ply.gz": _read_ply,
+    ".pcd.gz": _read_pcd,
+    **dict.fromkeys((f"{s}.gz" for s in _TEXT), read_text_cloud),
     **dict.fromkeys(IMAGES, read_depth_image),
-    **dict.fromkeys((*_TEXT, *(f"{s}.gz" for s in _TEXT)), lambda path, form: read_text_cloud(path)),
 }
+"""The forms of clouds: a new one is a row here and its function. The first is taken where a folder holds several."""
+SUFFIXES = tuple(_READERS)
+_NOTES = (".csv", ".txt", ".csv.gz", ".txt.gz", *IMAGES)
+# such a file beside the clouds is a cloud, not somebody's notes or pictures
+NO_NOTES = tuple(s for s in SUFFIXES if s not in _NOTES)

@@ -11,20 +11,29 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.formats import may_hold_poses
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import ENDINGS, natural, number_of
+from weldcal.calibration.data.poses.lists import pose_a_file, read_lists, together
+from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.source import robot_list
 from weldcal.calibration.data.poses.trees import stacked
-from weldcal.calibration.profiler.exports import TABLES, TREES, UNITS, Profiles, joined, listed_columns, read_profiles
+from weldcal.calibration.profiler.exports import (
+    SECONDS,
+    TABLES,
+    TREES,
+    UNITS,
+    Profiles,
+    joined,
+    listed_columns,
+    read_profiles,
+)
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 
 _POSE_NAME = re.compile(r"(?i)(^|[^a-z])(pos|rob)\d*($|[^a-z])|pose|robot|flange|tcp|tool")
-_POSE_ENDINGS = (*ENDINGS, ".rob")
 _MILLIMETRES = 10.0  # a median distance of the flange above it is in millimetres
 _WIDE = 1.0  # a laser line of more than this is in millimetres
 _MOST_FILES = 20_000
@@ -78,12 +87,25 @@ def import_profiles(
     listing = _poses(path, found, beside, poses)
     if form:
         listing = listing.stated(PoseForm(rotation=form), _OPTION)
-    rows, kept = _paired(listing, found)
+    same = {number_of(i) for i in listing.ids} == {number_of(i) for i in found.ids}
+    seconds = found.times * SECONDS[found.time_unit] if found.times is not None and found.time_unit else None
+    ids = found.ids if same or len(found) != len(listing) else ()
+    shown = Listing(name=found.source, numbers=(), ids=ids, times=seconds, joints=np.zeros((len(found), 0)))
+    rows, kept, _ = together(listing, shown)
+    alone = [
+        f"{one.ids[k] if one.ids else f'row {k + 1}'} of {one.name}: It has no partner."
+        for one, used in ((listing, rows), (shown, kept))
+        for k in range(len(one))
+        if k not in set(used.tolist())
+    ]
     good = listing.good[rows]
     rows, kept = rows[good], kept[good]
     if not len(rows):
-        raise InputError(f"'{listing.name}' holds no pose for any of the {len(found)} profiles of '{found.source}'.")
-    readings, words = _metric_poses(listing, rows, unit)
+        why = f": {listing.left_out[0][1]}" if listing.left_out else "."
+        raise InputError(
+            f"'{listing.name}' holds no pose for any of the {len(found)} profiles of '{found.source}'{why}"
+        )
+    readings, words = _metric_poses(listing, rows, unit, alone)
     length = profile_unit(found, unit)
     profiles = tuple(UNITS[length] * found.points[k] for k in kept)
     reading: dict[str, dict[str, object]] = {
@@ -122,7 +144,9 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
         p
         for place in (path, *sorted(q for q in path.iterdir() if q.is_dir() and not q.name.startswith((".", "_"))))
         for p in sorted(place.iterdir(), key=lambda q: natural(q.name))
-        if p.is_file() and p.suffix.lower() in (*TABLES, *TREES, *_POSE_ENDINGS) and not p.name.startswith((".", "_"))
+        if p.is_file()
+        and (p.suffix.lower() in (*TABLES, *TREES) or may_hold_poses(p))
+        and not p.name.startswith((".", "_"))
     ]
     if len(files) > _MOST_FILES:
         raise InputError(f"'{path.name}' holds {len(files)} files, more than {_MOST_FILES}, the most that are read.")
@@ -181,7 +205,7 @@ def _beside(path: Path) -> list[Path]:
             for p in path.parent.iterdir()
             if p != path
             and p.is_file()
-            and p.suffix.lower() in _POSE_ENDINGS
+            and may_hold_poses(p)
             and _POSE_NAME.search(p.stem)
             and not p.name.startswith(".")
         ]
@@ -243,15 +267,7 @@ def _no_poses(found: Profiles) -> str:
 def _listing(files: Sequence[Path], name: str) -> Listing:
     if len(files) == 1:
         return robot_list(_lists(read_lists(files[0]), files[0]), files[0].name, PoseForm())
-    lists = [_lists(lists_of_file(p), p) for p in files]
-    many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
-    if many is not None:
-        raise InputError(
-            f"'{many.name}' does not hold one pose, as the {len(files) - 1} files beside it do; give one pose a file."
-        )
-    return stacked(
-        [found[0] for found in lists], f"{name}, {files[0].name} ... {files[-1].name}", tuple(p.stem for p in files)
-    )
+    return pose_a_file(files, f"{name}, {files[0].name} ... {files[-1].name}")
 
 
 def _lists(lists: list[Listing], path: Path) -> list[Listing]:
@@ -262,24 +278,8 @@ def _lists(lists: list[Listing], path: Path) -> list[Listing]:
     return lists
 
 
-def _paired(listing: Listing, found: Profiles) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the poses and profiles that belong together: by the numbers in their names, else in order."""
-    numbers = [[number_of(i) for i in ids] for ids in (listing.ids, found.ids)]
-    known = all(n and None not in n and len(set(n)) == len(n) for n in numbers)
-    if len(listing) == len(found) and not (known and set(numbers[0]) == set(numbers[1])):
-        return np.arange(len(found)), np.arange(len(found))
-    if known:
-        common = sorted(set(numbers[0]) & set(numbers[1]))  # type: ignore[type-var]
-        if common and len(common) == min(len(listing), len(found)):
-            return np.array([numbers[0].index(k) for k in common]), np.array([numbers[1].index(k) for k in common])
-    raise InputError(
-        f"'{listing.name}' holds {len(listing)} poses and '{found.source}' {len(found)} profiles; without numbers in a"
-        " column id they pair in order, one for one: remove what has no partner, or number both alike."
-    )
-
-
 def _metric_poses(
-    listing: Listing, rows: np.ndarray, unit: str | None
+    listing: Listing, rows: np.ndarray, unit: str | None, alone: Sequence[str] = ()
 ) -> tuple[tuple[PoseReading, ...], dict[str, object]]:
     """Return the different readings of the poses, in metres, and how the list was understood."""
     readings: list[PoseReading] = []
@@ -300,7 +300,7 @@ def _metric_poses(
         "unit": length,
         "reading": readings[0].form,
         "rows": len(listing),
-        "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out],
+        "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out] + list(alone),
     }
     return tuple(metric), words
 

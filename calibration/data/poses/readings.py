@@ -204,13 +204,13 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     largest = float(np.abs(numbers.r).max(initial=0.0))
     if numbers.angles == "rad" and largest > _TURN_RAD:
         raise DatasetError(
-            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians. State degrees"
-            " by 'poses: {angles: deg}' in dataset.yaml, for hand-eye by --as robot-form=deg or --as camera-form=deg."
+            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they seem to be degrees."
+            " State them by 'poses: {angles: deg}' in dataset.yaml, or by --as robot-form=deg or --as camera-form=deg."
         )
     if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:
         raise DatasetError(
             f"No angle of '{numbers.source}' exceeds {largest:.2f}, as degrees: they look like radians. State rad"
-            " by 'poses: {angles: rad}' in dataset.yaml, for hand-eye by --as robot-form=rad or --as camera-form=rad."
+            " by 'poses: {angles: rad}' in dataset.yaml, or by --as robot-form=rad or --as camera-form=rad."
         )
     units = [numbers.angles] if numbers.angles else ["deg"] if largest > _TURN_RAD else ["rad", "deg"]
     if not numbers.angles and largest <= _LEAST_DEG:

@@ -11,16 +11,8 @@ from weldcal.calibration.data.checks import JOINT_NAME, read_rows
 from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.names import (
-    BASES,
-    ENDINGS,
-    FLANGES,
-    columns_of,
-    joint_columns,
-    natural,
-    number_of,
-    whose,
-)
+from weldcal.calibration.data.poses.formats import may_hold_poses
+from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, joint_columns, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
@@ -229,7 +221,7 @@ def _files(folder: Path) -> list[Path]:
     found = [
         p
         for p in folder.iterdir()
-        if p.suffix.lower() in ENDINGS and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
+        if may_hold_poses(p) and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
     ]
     return sorted(found, key=lambda p: natural(p.name))
 
@@ -239,19 +231,10 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm, arm: str = "") -
 
     Raises DatasetError, one sentence that says what to change.
     """
-    from weldcal.calibration.data.poses.lists import lists_of_file, read_lists  # poses.csv needs none of these readers
-    from weldcal.calibration.data.poses.trees import stacked
+    from weldcal.calibration.data.poses.lists import pose_a_file, read_lists  # poses.csv needs none of these readers
 
     if isinstance(source, tuple):
-        lists = [lists_of_file(path) for path in source]
-        many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
-        if many is not None:
-            raise DatasetError(
-                f"'{many.name}' holds more than one pose, and there are {len(source)} such files; give one or the"
-                " other."
-            )
-        name = f"{source[0].name} ... {source[-1].name}"
-        found = stacked([one[0] for one in lists], name, tuple(p.stem for p in source))
+        found = pose_a_file(source, f"{source[0].name} ... {source[-1].name}")
         found = replace(found, form=f"one file per pose, {found.form}")
     else:
         found = robot_list(read_lists(source), source.name, form)
