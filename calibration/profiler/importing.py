@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.bag import find_bag
 from weldcal.calibration.data.poses.formats import may_hold_poses
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import pose_a_file, read_lists, together
+from weldcal.calibration.data.poses.lists import folder_lists, pose_a_file, read_lists, together
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.source import robot_list
@@ -218,12 +219,9 @@ def _beside(path: Path) -> list[Path]:
 def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | None) -> Listing:
     """Return the list of the flange's poses: the stated file's, the table's own, or that of the files beside."""
     if stated is not None:
-        files = (
-            sorted((p for p in stated.iterdir() if p.is_file()), key=lambda p: natural(p.name))
-            if stated.is_dir()
-            else [stated]
-        )
-        return _listing(files, stated.name)
+        bag = find_bag(stated) if stated.exists() else None
+        lists = folder_lists(stated, 1) if bag is None and stated.is_dir() else read_lists(bag or stated)
+        return robot_list(lists, stated.name, PoseForm())
     if found.poses is not None:
         return found.poses
     single = [p for p in beside if number_of(p.stem) is None] or list(beside)

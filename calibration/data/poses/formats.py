@@ -1,9 +1,6 @@
 """Every form of a file of poses: a row of FORMATS and the function that reads it. A new form is one of each."""
 
-import gzip
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +12,7 @@ from weldcal.calibration.data.poses.names import TEXT, TREES
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
+from weldcal.models.files import LARGEST_DOCUMENT, file_size, read_bytes, read_text, require_few_lines
 
 if TYPE_CHECKING:
     from weldcal.calibration.data.poses.listing import Listing
@@ -70,7 +67,7 @@ def format_of(path: Path) -> Format:
 
     Raises InputError.
     """
-    ending = path.suffix.lower()
+    ending = ".mcap" if path.is_dir() else path.suffix.lower()  # a folder that is named is a recording of ROS 2
     ending = ending if any(ending in one.endings for one in FORMATS) else TEXT[0]
     return next(one for one in FORMATS if ending in one.endings and one.sniff(path))
 
@@ -93,7 +90,8 @@ def read_recording(path: Path) -> Recording:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
     """
     try:
-        file_size(path)
+        if not path.is_dir():
+            file_size(path)
         return format_of(path).read(path)
     except DatasetError:
         raise
@@ -155,33 +153,11 @@ def _is_numbers(path: Path) -> bool:
 
 
 def _workbook(path: Path) -> Recording:
-    from weldcal.calibration.data.poses.text import lists_of_text
+    from weldcal.calibration.data.poses.text import lists_of_text, sheets_of
 
-    try:
-        from openpyxl import load_workbook
-    except ImportError as problem:
-        raise DatasetError(
-            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install"
-            " openpyxl)."
-        ) from problem
-    try:
-        book = load_workbook(path, read_only=True, data_only=True)
-        sheets = {
-            sheet.title: "\n".join(
-                ";".join("" if cell is None else str(cell) for cell in row)
-                for row in sheet.iter_rows(max_row=MOST_CELLS, values_only=True)
-            )
-            for sheet in book.worksheets
-        }
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as problem:
-        raise DatasetError(
-            f"'{path.name}' cannot be read as an Excel file ({type(problem).__name__}); save it as CSV."
-        ) from problem
-    found = []
-    for title, text in sheets.items():
-        if text.strip():
-            found += lists_of_text(text, f"{path.name}, {title}" if len(sheets) > 1 else path.name)
-    return Recording(found)
+    sheets = sheets_of(path)
+    names = {title: f"{path.name}, {title}" if len(sheets) > 1 else path.name for title in sheets}
+    return Recording([one for title, text in sheets.items() for one in lists_of_text(text, names[title])])
 
 
 def _document(path: Path) -> Recording:
@@ -227,19 +203,10 @@ def _text(path: Path) -> Recording:
 
 
 def _program(path: Path) -> Recording:
-    """Read a robot program that is stored compressed."""
+    from weldcal.calibration.data.poses.programs import unzipped
     from weldcal.calibration.data.poses.text import lists_of_text
 
-    try:
-        with gzip.open(path) as stream:
-            found = stream.read(LARGEST_DOCUMENT + 1)
-    except gzip.BadGzipFile:
-        return _text(path)
-    except (OSError, EOFError, zlib.error) as problem:
-        raise DatasetError(f"'{path.name}' is damaged: its compressed text does not end.") from problem
-    if len(found) > LARGEST_DOCUMENT:
-        raise DatasetError(f"'{path.name}' holds more than {LARGEST_DOCUMENT // 2**20} MiB of text.")
-    return Recording(lists_of_text(found.decode("utf-8", "replace"), path.name))
+    return Recording(lists_of_text(unzipped(path), path.name))
 
 
 def _recording(path: Path) -> Recording:

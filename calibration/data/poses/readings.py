@@ -92,14 +92,16 @@ class PoseReading:
     doubted: bool = False
 
     def changed(self, change: str) -> "PoseReading":
-        """Return the reading with one of CHANGES applied."""
+        """Return the reading with one of CHANGES applied; one that was applied last is taken back."""
         words = {
             "transposed": "rotations transposed",
             "left_handed": "in a left-handed frame (y mirrored)",
             "inverse": "inverted",
         }[change]
-        X = apply_change(self.X, change)
-        return replace(self, form=f"{self.form},{change}", words=f"{self.words}, {words}", X=X)
+        X, last = apply_change(self.X, change), f",{change}"
+        if self.form.endswith(last):
+            return replace(self, form=self.form.removesuffix(last), words=self.words.removesuffix(f", {words}"), X=X)
+        return replace(self, form=self.form + last, words=f"{self.words}, {words}", X=X)
 
 
 def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[PoseReading]:

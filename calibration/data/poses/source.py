@@ -264,7 +264,8 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
     """
     if len(lists) == 1:
         return lists[0]
-    frames = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists if " to " in one.name}
+    labels = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists}
+    frames = {pair: one for pair, one in labels.items() if len(pair) == 2}
     if frames:
         flanges = [form.flange_frame] if form.flange_frame else list(FLANGES)
         bases = (
@@ -281,7 +282,9 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
             f"'{name}' holds the transforms {pairs}, none from the base to the flange; set poses.base_frame and"
             " poses.flange_frame in dataset.yaml, or record the pose topic of the driver."
         )
-    mine = [one for one in lists if whose(one.name) == "robot"]
+    from weldcal.calibration.data.poses.lists import without_copies  # as in read_poses
+
+    mine = without_copies([one for one in lists if whose(one.name) == "robot"])
     if len(mine) == 1:
         return mine[0]
     known = ", ".join(repr(one.name) for one in lists[:6])

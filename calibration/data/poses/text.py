@@ -4,11 +4,12 @@ Tables with or without a header, blocks of numbers, robot programs and what ROS 
 """
 
 import re
+import zipfile
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from weldcal.calibration.data.poses.names import PoseColumn, columns_of, distinc
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
-from weldcal.models.files import require_short_numbers
+from weldcal.models.files import MOST_CELLS, require_short_numbers
 from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
 _CELL = re.compile(rf"{NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
@@ -55,6 +56,31 @@ _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("e1 e2 e3", {"vector": False, "form": "x, y, z and three angles"}),
 )
 """The columns of a rotation, and what they say of it, in the order in which they are sought."""
+
+
+def sheets_of(path: Path) -> dict[str, str]:
+    """Return the sheets of an Excel file that hold anything, as text with semicolons. Raises DatasetError."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError as problem:
+        raise DatasetError(
+            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install"
+            " openpyxl)."
+        ) from problem
+    try:
+        book = load_workbook(path, read_only=True, data_only=True)
+        sheets = {
+            sheet.title: "\n".join(
+                ";".join("" if cell is None else str(cell) for cell in row)
+                for row in sheet.iter_rows(max_row=MOST_CELLS, values_only=True)
+            )
+            for sheet in book.worksheets
+        }
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as problem:
+        raise DatasetError(
+            f"'{path.name}' cannot be read as an Excel file ({type(problem).__name__}); save it as CSV."
+        ) from problem
+    return {title: text for title, text in sheets.items() if text.strip()}
 
 
 def lists_of_text(text: str, name: str) -> list[Listing]:
@@ -290,9 +316,6 @@ def _named(header: Sequence[str]) -> int:
 def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
     header = distinct(header)
     _, other = columns_of(header)
-    again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
-    if again is not None:
-        raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
     child = next((k for k, h in enumerate(header) if h.lower().endswith("child_frame_id")), None)
     if child is not None:
         parent = next((k for k, h in enumerate(header) if h.lower().endswith("frame_id") and k != child), child)
@@ -343,6 +366,9 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     Raises:
         DatasetError: a list has no position or no rotation, or an angle of a joint is none.
     """
+    again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
+    if again is not None:
+        raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
     columns, other = columns_of(header)
     times = table[:, other["time"]] if "time" in other else None
     if times is not None:

@@ -28,6 +28,7 @@ from weldcal.models.files import LARGEST_NUMBER
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
 LENGTHS = UNITS
+NO_MOUNTING = "'{}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +145,8 @@ def _pairs(
             stated, robot=replace(stated.robot, frame="base_in_flange")
         )  # easy_handeye then stores the base in the hand
     arm = stated.arm or _word(path, raw, "robot")
-    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit, arm=arm))
+    by = f"the unit in '{path.name}'" if unit else stated.unit_by
+    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit, unit_by=by, arm=arm))
     found_pairs = import_pairs(lists, path.name, mode, stated)
     rows_r, rows_c = found_pairs.rows
     arrays: dict[str, Array | None] = {}
@@ -203,7 +205,7 @@ def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], Mapping[s
         if (lists := at_rest(*recorded)) is None:
             raise DatasetError(
                 f"'{path.name}' has fewer than {FEWEST_RESTS} poses at which the arm rested and the camera saw the"
-                " board: let it rest for a second at each pose, and record again. (`hand-eye` also reads a motion.)"
+                " board, and no motion of both over 3 s: let it rest for a second at each pose, and record again."
             )
         return lists, {}
     if path.is_dir():
@@ -278,9 +280,7 @@ def _mode(path: Path, raw: Mapping[str, Any], mounting: str | None, two_robots: 
         )
     mode = mounting or found or ("co_manipulation" if two_robots else None)
     if mode is None:
-        raise DatasetError(
-            f"'{path.name}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
-        )
+        raise DatasetError(NO_MOUNTING.format(path.name))
     get_mounting(mode)
     return mode
 

@@ -406,7 +406,7 @@ def test_other_counts_of_poses_and_profiles_are_refused(tmp_path: Path) -> None:
     code, text, _ = run("sphere", tmp_path / "export.csv", "--radius", RADIUS)
     assert code == 1, text
     assert f"{SCANS - 3} poses" in text
-    assert f"{SCANS} profiles" in text
+    assert f"'export.csv' holds {SCANS};" in text
 
 
 def test_unnamed_columns_are_refused_with_an_example_that_works(tmp_path: Path) -> None:
