@@ -185,8 +185,6 @@ def _read(file: Path, asked: HandEyeOptions) -> tuple[PosePairs, ClockOffset | N
         shots = read_pictures(file, board, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics)
         return shots.pairs, None, shots
     if asked.motions:
-        if pose_streams.is_stream_file(file):
-            raise InputError("Two streams of poses are no motions; omit --as motions.")
         return read_pairs(file, mounting=mounting, length=unit, stated=replace(stated, decide=False)), None, None
     return *pairs_or_streams(file, mounting=mounting, unit=unit, stated=stated, usual="eye_in_hand"), None
 

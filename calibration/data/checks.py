@@ -239,13 +239,19 @@ def cloud_form(header: DatasetHeader, folder: Path) -> CloudForm:
     )
 
 
-def is_motion(folder: Path) -> bool:
-    """Return whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+def header_of(folder: Path) -> DatasetHeader | None:
+    """Return what a folder's dataset.yaml states; None where there is none, or none that can be read."""
     path = Path(folder) / "dataset.yaml"
     try:
-        return path.is_file() and read_header(path).mode == "motion"
+        return read_header(path) if path.is_file() else None
     except DatasetError:
-        return False
+        return None
+
+
+def is_motion(folder: Path) -> bool:
+    """Return whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+    header = header_of(folder)
+    return header is not None and header.mode == "motion"
 
 
 def is_carried(folder: Path) -> bool:
@@ -253,11 +259,7 @@ def is_carried(folder: Path) -> bool:
 
     False where it cannot be read.
     """
-    path = Path(folder) / "dataset.yaml"
-    try:
-        header = read_header(path) if path.is_file() else None
-    except DatasetError:
-        return False
+    header = header_of(folder)
     return header is not None and header.mode != "motion" and header.configuration != CONFIGURATIONS[0]
 
 

@@ -17,8 +17,9 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import folder_lists, pose_a_file, read_lists, together
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
-from weldcal.calibration.data.poses.source import robot_list
+from weldcal.calibration.data.poses.source import robot_list, unit_by_size
 from weldcal.calibration.data.poses.trees import stacked
+from weldcal.calibration.geometry.se3 import scaled
 from weldcal.calibration.profiler.exports import (
     SECONDS,
     TABLES,
@@ -35,7 +36,6 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 
 _POSE_NAME = re.compile(r"(?i)(^|[^a-z])(pos|rob)\d*($|[^a-z])|pose|robot|flange|tcp|tool")
-_MILLIMETRES = 10.0  # a median distance of the flange above it is in millimetres
 _WIDE = 1.0  # a laser line of more than this is in millimetres
 _MOST_FILES = 20_000
 _OPTION = "--as robot-form"
@@ -264,16 +264,8 @@ def _no_poses(found: Profiles) -> str:
 
 def _listing(files: Sequence[Path], name: str) -> Listing:
     if len(files) == 1:
-        return robot_list(_lists(read_lists(files[0]), files[0]), files[0].name, PoseForm())
+        return robot_list(read_lists(files[0]), files[0].name, PoseForm())
     return pose_a_file(files, f"{name}, {files[0].name} ... {files[-1].name}")
-
-
-def _lists(lists: list[Listing], path: Path) -> list[Listing]:
-    if not lists:
-        raise InputError(
-            f"'{path.name}' holds no poses. Give a row for each profile, such as x_mm,y_mm,z_mm,qw,qx,qy,qz."
-        )
-    return lists
 
 
 def _metric_poses(
@@ -284,14 +276,8 @@ def _metric_poses(
     for one in pick(listing.readings, rows):
         if not any(np.abs(one.X - other.X).max() < 1e-9 for other in readings):
             readings.append(one)
-    p = readings[0].X[:, :3, 3]
-    length = listing.unit or unit or ("mm" if float(np.median(np.linalg.norm(p, axis=1))) > _MILLIMETRES else "m")
-    scale = UNITS[length]
-    metric = []
-    for one in readings:
-        X = one.X.copy()
-        X[:, :3, 3] *= scale
-        metric.append(replace(one, X=X))
+    length = listing.unit or unit or unit_by_size(readings[0].X[:, :3, 3])
+    metric = tuple(replace(one, X=scaled(one.X, UNITS[length])) for one in readings)
     words: dict[str, object] = {
         "file": listing.name,
         "form": listing.form,
@@ -300,7 +286,7 @@ def _metric_poses(
         "rows": len(listing),
         "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out] + list(alone),
     }
-    return tuple(metric), words
+    return metric, words
 
 
 def profile_unit(found: Profiles, unit: str | None) -> str:

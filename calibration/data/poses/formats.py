@@ -32,12 +32,7 @@ _TABLE_TEXT = re.compile(r"(?m)^At time|Translation: \[")
 
 @dataclass(frozen=True)
 class Recording:
-    """What a file holds.
-
-    Attributes:
-        lists: every list of poses.
-        stated: what else it says: its `mode` (mounting), `unit` and EXTRAS.
-    """
+    """What a file holds: every list of poses, and what else is stated: `mode` (mounting), `unit` and EXTRAS."""
 
     lists: "list[Listing]"
     stated: Mapping[str, Any] = field(default_factory=dict)
@@ -45,14 +40,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Format:
-    """One form of a file.
+    """One form of a file: its name for messages, endings and reader.
 
-    Attributes:
-        says: the form's name, for messages.
-        endings: of its files.
-        read: the function that reads it.
-        sniff: tells forms of one ending apart; the first row that fits is taken.
-        in_folders: whether such a file is sought in folders; else it must be named.
+    ``sniff`` tells forms of one ending apart. ``in_folders``: whether it is sought in folders, or must be named.
     """
 
     says: str

@@ -139,7 +139,7 @@ def _group(files: list[Path], label: str) -> list[Listing]:
             return [
                 stacked(
                     [lists[k][j] for k in order],
-                    f"{prefix}{files[0].name} ..., {_key_of(lists[0][j])}",
+                    f"{prefix}{files[0].name} ..., {lists[0][j].name.rpartition(', ')[2]}",
                     tuple(ids[k] for k in order),
                 )
                 for j in range(each)
@@ -147,10 +147,6 @@ def _group(files: list[Path], label: str) -> list[Listing]:
         raise DatasetError(_NOT_ONE.format(many.name, len(files) - 1))
     name = f"{prefix}{files[0].name}" if alike else f"{prefix}{files[0].name} ... {files[-1].name}"
     return [stacked([lists[k][0] for k in order], name, tuple(ids[k] for k in order))]
-
-
-def _key_of(listing: Listing) -> str:
-    return listing.name.rpartition(", ")[2]
 
 
 def _renamed(listing: Listing, prefix: str) -> Listing:

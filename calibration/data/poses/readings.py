@@ -109,6 +109,13 @@ def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[
     return [replace(one, X=one.X[rows]) for one in listed]
 
 
+def change_of(one: PoseReading, listed: Sequence[PoseReading]) -> str | None:
+    """Return the change by which a reading differs from those that are stated; None: it is one of them."""
+    if any(one.form == other.form for other in listed):
+        return None
+    return next(by for by in CHANGES if any(other.changed(by).form == one.form for other in listed))
+
+
 def apply_change(X: Array, change: str) -> Array:
     """Poses (n, 4, 4) with one of CHANGES applied."""
     if change == "inverse":

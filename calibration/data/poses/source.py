@@ -177,17 +177,17 @@ def find_poses(folder: Path) -> Path | tuple[Path, ...] | None:
     Known are poses.* and the like, a folder poses/, and files such as pos01.yaml beside the clouds.
     """
     for stem in _STEMS:
-        for path in _files(folder):
+        for path in files_of_poses(folder):
             if path.stem.lower() == stem:
                 return path
     for name in _FOLDERS:
-        inside = _files(folder / name) if (folder / name).is_dir() else []
+        inside = files_of_poses(folder / name) if (folder / name).is_dir() else []
         if inside:
             return tuple(inside) if len(inside) > 1 else inside[0]
-    for path in _files(folder):
+    for path in files_of_poses(folder):
         if "pose" in path.stem.lower() and number_of(path.stem) is None:
             return path
-    each = [p for p in _files(folder) if p.stem.lower().startswith(_ONE) and number_of(p.stem) is not None]
+    each = [p for p in files_of_poses(folder) if p.stem.lower().startswith(_ONE) and number_of(p.stem) is not None]
     kinds = {p.suffix.lower() for p in each}
     if len(each) > 1 and len(kinds) == 1:
         return tuple(each)
@@ -212,12 +212,8 @@ def is_plain(path: Path) -> bool:
     return "id" in names and roles <= own and not any(c.unit for c in columns) and not any("." in n for n in names)
 
 
-def files_of_poses(folder: Path) -> tuple[Path, ...]:
+def files_of_poses(folder: Path) -> list[Path]:
     """Return the files of a folder that may hold poses, in the natural order of their names."""
-    return tuple(_files(folder))
-
-
-def _files(folder: Path) -> list[Path]:
     found = [
         p
         for p in folder.iterdir()
@@ -264,6 +260,8 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
     """
     if len(lists) == 1:
         return lists[0]
+    if not lists:
+        raise DatasetError(f"'{name}' holds no poses. Give a row for each pose, such as x_mm,y_mm,z_mm,qw,qx,qy,qz.")
     labels = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists}
     frames = {pair: one for pair, one in labels.items() if len(pair) == 2}
     if frames:
@@ -291,6 +289,11 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
     raise DatasetError(f"'{name}' holds several lists of poses: {known}. Keep the one of the flange in the base.")
 
 
+def unit_by_size(p: Array) -> str:
+    """Return the unit of the positions (n, 3) of an arm's flange or of a board by their median distance: m or mm."""
+    return "mm" if float(np.median(np.linalg.norm(p, axis=1))) > _MILLIMETRES else "m"
+
+
 def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str]:
     """Flange poses X_BF (n, 4, 4) in metres, and the unit that was taken.
 
@@ -312,7 +315,7 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
         form = PoseForm()
     X = inverse(found.X) if form.frame == "base_in_flange" else found.X.copy()
     if unit == "auto":
-        unit = found.unit or ("mm" if float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) > _MILLIMETRES else "m")
+        unit = found.unit or unit_by_size(X[:, :3, 3])
     X[:, :3, 3] *= {"m": 1.0, "mm": 1e-3}[unit]
     if form.tcp:
         tcp = np.asarray(form.tcp, dtype=float)

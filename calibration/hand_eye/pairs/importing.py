@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
-from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
+from weldcal.calibration.data.poses.readings import PoseReading, change_of, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.robust import Rows
 from weldcal.calibration.geometry.se3 import scaled
@@ -219,15 +219,8 @@ def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
 
 def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading]:
     """The readings, and the wanted one's change applied to them all."""
-    by = _change(wanted, listed)
+    by = change_of(wanted, listed)
     return listed if by is None else [*listed, *(one.changed(by) for one in listed)]
-
-
-def _change(one: PoseReading, listed: list[PoseReading]) -> str | None:
-    """Return the change by which a reading differs from those that are stated; None: it is one of them."""
-    if any(one.form == other.form for other in listed):
-        return None
-    return next(by for by in CHANGES if any(other.changed(by).form == one.form for other in listed))
 
 
 def _option(who: str, one: PoseReading, listing: Listing) -> str:
@@ -347,7 +340,7 @@ def _require_one(
             )
         return
     ones = (best.robot, best.camera)
-    own = [_change(one, listed) for one, listed in zip(ones, stated, strict=True)]
+    own = [change_of(one, listed) for one, listed in zip(ones, stated, strict=True)]
     by, k = own[0] or own[1], int(own[0] is None)  # the change beyond what is stated, and whose list it is
     options = [
         _option(who, one if mine or by is None else one.changed(by), listing)
@@ -361,7 +354,7 @@ def _require_one(
         raise InconsistentPoses(
             f"With --mounting {mounting} the {what} of '{source}' contradict {whom}."
             f" {'Two' if camera_known else 'Three'} corrections fit equally well ({_residual(best)}):"
-            f" {'; '.join(corrections[:-1])}; or {corrections[-1]}. Give the option that is true."
+            f" {', '.join(corrections[:-1])}, or {corrections[-1]}. Give the option that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
