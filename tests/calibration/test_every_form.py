@@ -10,7 +10,9 @@ import pytest
 
 from tests.calibration.hand_eye.pair_sources import READ
 from tests.calibration.hand_eye.pair_world import BASE, HAND, X_BASE, A, B, X
+from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.eye_on_base.observations import choose_reading
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.recorded_hand_eye import pairs_or_streams, stated_forms
@@ -83,6 +85,18 @@ def test_a_stated_change_that_is_wrong_is_named_and_the_advice_ends(tmp_path: Pa
     forms[who] = advised[0]
     read = read_pairs(tmp_path / "a.npz", stated=stated_forms(None, None, forms["robot"], forms["camera"]))
     np.testing.assert_allclose(read.robot, A)
+
+
+def test_scans_name_a_stated_transposition_that_is_wrong() -> None:
+    X_CB = np.linalg.inv(X_BASE)
+    seen = X_CB @ A
+    plain = PoseReading("matrix", "matrices", A)
+    stated = plain.changed("transposed")
+    with pytest.raises(InconsistentPoses, match=r"only if they are not .*\{rotation: matrix\}"):
+        choose_reading([stated], np.arange(len(A)), seen[:, :3, 3], seen[:, :3, 2], np.eye(4))
+    found, _ = choose_reading([plain], np.arange(len(A)), seen[:, :3, 3], seen[:, :3, 2], np.eye(4))
+    assert found is plain
+    assert stated.changed("transposed").form == "matrix"
 
 
 def test_a_name_that_inverts_a_list_is_part_of_the_advice(tmp_path: Path) -> None:
