@@ -17,7 +17,7 @@ BOUNDS = {
     "code lines of calibration": 30_253,
     "code lines of models": 6_372,
     "code lines of systems": 19_402,
-    "code lines of tools": 23_012,
+    "code lines of tools": 23_014,
     "code lines of welding": 9_685,
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

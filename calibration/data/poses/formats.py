@@ -31,7 +31,7 @@ _TABLE_TEXT = re.compile(r"(?m)^At time|Translation: \[")
 
 
 @dataclass(frozen=True)
-class Recording:
+class PoseFile:
     """What a file holds: every list of poses, and what else is stated: `mode` (mounting), `unit` and EXTRAS."""
 
     lists: "list[Listing]"
@@ -47,7 +47,7 @@ class Format:
 
     says: str
     endings: tuple[str, ...]
-    read: Callable[[Path], Recording]
+    read: Callable[[Path], PoseFile]
     sniff: Callable[[Path], bool] = lambda path: True
     in_folders: bool = True
 
@@ -73,7 +73,7 @@ def known_forms() -> str:
     return "; ".join(f"{says} ({endings})" for says, endings in known.items())
 
 
-def read_recording(path: Path) -> Recording:
+def read_recording(path: Path) -> PoseFile:
     """Read a file of any form.
 
     Raises:
@@ -89,7 +89,7 @@ def read_recording(path: Path) -> Recording:
         raise DatasetError(str(problem)) from problem
 
 
-def _npz(path: Path) -> Recording:
+def _npz(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.trees import lists_of_tree
 
     arrays = read_npz(path)
@@ -103,7 +103,7 @@ def _npz(path: Path) -> Recording:
         next((_word(arrays[k]) for k in keys if k in arrays and np.size(arrays[k]) == 1), "")
         for keys in (("mode", "configuration"), ("unit",))
     )
-    return Recording(lists_of_tree({k: v for k, v in arrays.items() if k not in stated or k == "q"}, path.name), stated)
+    return PoseFile(lists_of_tree({k: v for k, v in arrays.items() if k not in stated or k == "q"}, path.name), stated)
 
 
 def _word(value: Any) -> str:
@@ -111,7 +111,7 @@ def _word(value: Any) -> str:
     return word.decode("utf-8", "replace") if isinstance(word, bytes) else str(word)
 
 
-def _npy(path: Path) -> Recording:
+def _npy(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.listing import listing_of_array
 
     try:
@@ -122,18 +122,18 @@ def _npy(path: Path) -> Recording:
         raise DatasetError(_PICKLED.format(path.name)) from problem
     if value.dtype.kind not in "fiu":
         raise DatasetError(f"'{path.name}' holds words, not numbers.")
-    return Recording([listing_of_array(path.name, value.astype(float))])
+    return PoseFile([listing_of_array(path.name, value.astype(float))])
 
 
-def _pickle(path: Path) -> Recording:
+def _pickle(path: Path) -> PoseFile:
     raise DatasetError(_PICKLED.format(path.name))
 
 
-def _matlab(path: Path) -> Recording:
+def _matlab(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.storage import matlab_arrays
     from weldcal.calibration.data.poses.trees import lists_of_tree
 
-    return Recording(lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name))
+    return PoseFile(lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name))
 
 
 def _is_numbers(path: Path) -> bool:
@@ -142,21 +142,21 @@ def _is_numbers(path: Path) -> bool:
         return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
 
 
-def _workbook(path: Path) -> Recording:
+def _workbook(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.text import lists_of_text, sheets_of
 
     sheets = sheets_of(path)
     names = {title: f"{path.name}, {title}" if len(sheets) > 1 else path.name for title in sheets}
-    return Recording([one for title, text in sheets.items() for one in lists_of_text(text, names[title])])
+    return PoseFile([one for title, text in sheets.items() for one in lists_of_text(text, names[title])])
 
 
-def _document(path: Path) -> Recording:
+def _document(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.storage import read_tree
     from weldcal.calibration.data.poses.text import keyed_lists
     from weldcal.calibration.data.poses.trees import lists_of_tree
 
     if path.suffix.lower() == ".xml" and (lines := keyed_lists(read_text(path), path.name)):
-        return Recording(lines)
+        return PoseFile(lines)
     tree = read_tree(path)
     named = tree if isinstance(tree, dict) else {}
     stated = {k: named[k] for k in (*EXTRAS, "unit") if k in named}
@@ -166,7 +166,7 @@ def _document(path: Path) -> Recording:
     samples = named.get("samples", named.get("poses")) if named else tree
     if isinstance(samples, list) and samples and all(isinstance(one, dict) and "q" in one for one in samples):
         stated["q"] = [one["q"] for one in samples]
-    return Recording(lists_of_tree(tree, path.name), stated)
+    return PoseFile(lists_of_tree(tree, path.name), stated)
 
 
 def _is_document(path: Path) -> bool:
@@ -176,33 +176,33 @@ def _is_document(path: Path) -> bool:
     return bool(_TREE_TEXT.search(begin)) and not _TABLE_TEXT.search(begin)
 
 
-def _document_text(path: Path) -> Recording:
+def _document_text(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.storage import tree_of_text
     from weldcal.calibration.data.poses.trees import lists_of_tree
 
     text = read_text(path)
     kind = "JSON" if text.lstrip().startswith(("{", "[")) else "YAML"
-    return Recording(lists_of_tree(tree_of_text(text, path.name, kind), path.name))
+    return PoseFile(lists_of_tree(tree_of_text(text, path.name, kind), path.name))
 
 
-def _text(path: Path) -> Recording:
+def _text(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.text import lists_of_text
 
     require_few_lines(path)
-    return Recording(lists_of_text(read_text(path), path.name))
+    return PoseFile(lists_of_text(read_text(path), path.name))
 
 
-def _program(path: Path) -> Recording:
+def _program(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.programs import unzipped
     from weldcal.calibration.data.poses.text import lists_of_text
 
-    return Recording(lists_of_text(unzipped(path), path.name))
+    return PoseFile(lists_of_text(unzipped(path), path.name))
 
 
-def _recording(path: Path) -> Recording:
+def _recording(path: Path) -> PoseFile:
     from weldcal.calibration.data.poses.bag import lists_of_recording
 
-    return Recording(lists_of_recording(path))
+    return PoseFile(lists_of_recording(path))
 
 
 FORMATS = (

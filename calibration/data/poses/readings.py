@@ -213,7 +213,7 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     largest = float(np.abs(numbers.r).max(initial=0.0))
     if numbers.angles == "rad" and largest > _TURN_RAD:
         raise DatasetError(
-            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they seem to be degrees."
+            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a turn in rad: they seem to be degrees."
             " State them by 'poses: {angles: deg}' in dataset.yaml, or by --as robot-form=deg or --as camera-form=deg."
         )
     if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:

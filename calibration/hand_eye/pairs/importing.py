@@ -1,7 +1,4 @@
-"""Import pairs of robot and camera poses.
-
-Find the two lists, pair their rows, and let the data choose how they are read.
-"""
+"""Import pairs of robot and camera poses: find both lists, pair their rows, and let the data choose the reading."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -44,7 +41,7 @@ it."""
 
 @dataclass(frozen=True, kw_only=True)
 class StatedForms:
-    """What the user states of the two lists: form and name of each, the unit of lengths of both and who states it, the robot."""
+    """What the user states of the two lists: form and name of each, the unit and who states it, the robot."""
 
     robot: PoseForm = field(default_factory=PoseForm)
     camera: PoseForm = field(default_factory=PoseForm)
@@ -285,7 +282,6 @@ def _left_out(listing: Listing, rows: Array, out: Array) -> list[str]:
 
 
 def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
-    """Refuses a list whose poses are all one. Raises InconsistentPoses."""
     X = reading.X
     if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
         raise InconsistentPoses(
@@ -323,10 +319,7 @@ def _require_one(
     mounting: str,
     camera_known: bool,
 ) -> None:
-    """Refuses readings that agree equally and differ in the result, or take back a stated change.
-
-    Raises InconsistentPoses.
-    """
+    """Raise InconsistentPoses where readings agree equally and differ, or take back a stated change."""
     best = decision.best
     other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
     if not best.agrees:
@@ -447,7 +440,7 @@ def _units(
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
         raise DatasetError(
             f"Read in {words[0]}, the robot positions of '{source}' have a median distance of {median * unit_r:.3g} m"
-            f" from the base. No arm has that reach: correct {stated.unit_by if not robot.unit else 'the unit in the file'}."
+            f" from the base. No arm reaches that: correct {'the unit in the file' if robot.unit else stated.unit_by}."
         )
     ratio = None
     if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:

@@ -10,7 +10,7 @@ import pytest
 from tests.calibration.hand_eye.pair_world import A, B
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses import formats
-from weldcal.calibration.data.poses.formats import Format, Recording, format_of, known_forms
+from weldcal.calibration.data.poses.formats import Format, PoseFile, format_of, known_forms
 from weldcal.calibration.data.poses.listing import listing_of_array
 from weldcal.calibration.data.poses.source import find_poses, read_poses
 from weldcal.calibration.errors import DatasetError
@@ -18,8 +18,8 @@ from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.profiler.importing import import_profiles
 
 
-def doubles(path: Path) -> Recording:
-    return Recording([listing_of_array(path.name, np.fromfile(path).reshape(-1, 4, 4))])
+def doubles(path: Path) -> PoseFile:
+    return PoseFile([listing_of_array(path.name, np.fromfile(path).reshape(-1, 4, 4))])
 
 
 ROW = Format("matrices as doubles", (".dbl",), doubles)

@@ -180,11 +180,13 @@ def read_profiler_file(
     cure = "Correct the file's entry 'unit' to" if path.suffix.lower() == ".npz" and unit is None else "Give --unit"
     if len(X) and float(np.abs(X.translation).max()) > FAR_M:
         raise InputError(
-            f"The flange would be {np.abs(X.translation).max():.0f} m from the base. {cure} mm if the lengths are in mm."
+            f"The flange would be {np.abs(X.translation).max():.0f} m from the base."
+            f" {cure} mm if the lengths are in mm."
         )
     if len(X) and float(np.abs(X.translation).max()) < NEAR_M:
         raise InputError(
-            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. {cure} m if the lengths are in m."
+            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base."
+            f" {cure} m if the lengths are in m."
         )
     return file
 
