@@ -205,7 +205,7 @@ def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], Mapping[s
         if (lists := at_rest(*recorded)) is None:
             raise DatasetError(
                 f"'{path.name}' has fewer than {FEWEST_RESTS} poses at which the arm rested and the camera saw the"
-                " board, and no motion of both over 3 s: let it rest for a second at each pose, and record again."
+                " board, and no motion of 3 s. Let it rest for a second at each pose, and record again."
             )
         return lists, {}
     if path.is_dir():
