@@ -108,7 +108,12 @@ def calibrate(
             )
         from weldcal.tools.commands.mounting_live import calibrate_recorded
 
-        return calibrate_recorded(call, dataset, robot, flange, poses=poses, limit_mm=limit_mm)
+        out, known = (
+            call.folder("calibrate", dataset.resolve().name),
+            {"robot": robot, "flange": flange, "poses": poses},
+        )
+        carried = calibrate_recorded(dataset, out, **known, limit_mm=limit_mm, progress=call.progress)
+        return Outcome(carried.summary(), text=carried.text(), first=carried.first)
     asked = FlangeOptions(
         robot=robot,
         flange=flange,

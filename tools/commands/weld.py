@@ -10,9 +10,8 @@ import numpy as np
 import typer
 
 from weldcal.calibration.calibrate import KINEMATICS_FILE
-from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
+from weldcal.calibration.data.header import Feature
 from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
-from weldcal.calibration.data.writing import save_dataset
 from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result, write_apart
@@ -32,7 +31,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.cli.result_folder import writer
-from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
+from weldcal.tools.commands.run import RECORDED, JobRun, named_once, placed, run_job, run_options, save_scans
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import write_atomic, write_json
@@ -352,39 +351,18 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
 
     `robot` is the name of the robot, for the dataset's note.
     """
-    cell, scanner = run.cell, run.cell.scenario.scanner_config()
-    observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
-    if not observed or scanner is None:
-        return None
-    preset = scanner.scanner()
-    c, X_RF = cell.scenario.calibration, cell.job.X_FR.inverse()
-    guess = c.mounting_guess.pose()
-    header = DatasetHeader(
-        robot=cell.scenario.arm,
-        flange=feature_standard(cell.scenario).designation,
-        scanner=preset.name,
+    X_FR, scenario = run.cell.job.X_FR, run.cell.scenario
+    return save_scans(
+        run,
+        folder,
+        {o.id: o.X_BR @ X_FR.inverse() for o in status.observations},
+        {o.id: q for o, q in zip(status.observations, status.joints, strict=False)},
+        scenario.calibration.mounting_guess.pose(),
+        flange=feature_standard(scenario).designation,
         configuration="eye_on_base",
         note=f"rendered scans of a run; robot: {robot}",
-        feature_in_flange=Feature(
-            _numbers(cell.job.X_FR.translation()), _numbers(cell.job.X_FR.rotation().ToQuaternion().wxyz())
-        ),
-        scanner_guess=ScannerGuess(
-            _numbers(guess.translation()), _numbers(guess.rotation().ToQuaternion().wxyz()), 1e-3 * c.guess_radius_mm
-        ),
+        feature_in_flange=Feature(**placed(X_FR)),
     )
-    save_dataset(
-        folder,
-        header,
-        {id: X_BR @ X_RF for id, X_BR in observed.items()},
-        {id: run.scans[id][0].points_C.astype(float) for id in observed},
-        times={id: run.scans[id][0].capture_time for id in observed},
-        intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
-    )
-    return folder
-
-
-def _numbers(values: np.ndarray) -> list[float]:
-    return [float(v) for v in values]
 
 
 def write_weld_log(record: WeldRecord, folder: Path) -> Path:

@@ -9,24 +9,13 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.planning.mounting_estimate import (
-    Circle,
-    MountingResult,
-    ObservedCircle,
-    expected_after,
-    expected_error,
-    fewest,
-    off_prediction,
-    see_circle,
-    solve_mounting,
-)
+from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
 from weldcal.calibration.planning.mounting_scene import FLANGE, FOOT, MountingScene
 from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import base_circle
 from weldcal.models.workpieces.part import WeldPart
@@ -36,13 +25,7 @@ from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.mounting.config import MountingJob
-from weldcal.systems.jobs.mounting.procedure import (
-    HeldOutScan,
-    MountingProcedure,
-    MountingState,
-    MountingStatus,
-    NextBest,
-)
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.motion.spine import Spine
@@ -118,54 +101,17 @@ def digest(
     config: MountingFitConfig,
     plan: Sequence[MountingPose],
 ) -> MountingStatus:
-    """Compute the status after one more scan; an unusable scan is listed as refused with its label and the reason."""
+    """Compute the status after one more scan, as `weldcal calibrate` does; then the pose that would help most."""
     status = dc.replace(status, sequence=scan.sequence)
     q, q_2 = joints
     if q is None or (scene.two and q_2 is None):
-        reason = "the arm's pose at the time of the scan is not known"
-        return dc.replace(status, refused=(*status.refused, (job.label, reason)), message=reason)
-    belief = scene if status.result is None else scene.believing(status.result.poses)
-    try:
-        seen = see_circle(scan.points_C.astype(float), belief, job.label, q, q_2, config.circle)
-    except FlangeNotFound as error:
-        return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
-    if job.purpose == "verify":
-        off = off_prediction(belief, seen, None if status.result is None else status.result.correction)
-        return dc.replace(status, held_out=(*status.held_out, HeldOutScan(job.label, *off)))
-    status = dc.replace(status, seen=(*status.seen, seen), message="")
-    if len(status.seen) < fewest(scene):
-        return status
-    try:
-        result = solve_mounting(scene, status.seen)
-    except WeldcalError as error:
-        return dc.replace(status, message=str(error))
-    sigma, within = expected_error(scene, result)
-    return dc.replace(
-        status,
-        result=result,
-        sigma_work_m=sigma,
-        error_95_m=within,
-        history=(*status.history, (len(status.seen), within)),
-        next_best=next_best(scene.believing(result.poses), result, status.seen, plan),
-        done=len(status.seen) >= config.minimum_scans and within <= config.required_error_m,
-    )
-
-
-def next_best(
-    belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
-) -> NextBest | None:
-    """Return the unvisited planned pose that reduces the expected error at the work point most.
-
-    All are reachable, visible and clear; None where all were visited.
-    """
-    left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
-    if not left:
-        return None
-    after = expected_after(belief, result, seen, left)
-    best = left[int(np.argmin(after))]
-    return NextBest(
-        best.q, best.q_2, belief.frames(best.q)[FLANGE], expected_error(belief, result)[0], float(after.min())
-    )
+        return status.refusing(job.label, "the arm's pose at the time of the scan is not known")
+    verify, points = job.purpose == "verify", scan.points_C.astype(float)
+    found = status.with_scan(scene, config.circle, job.label, points, (q, q_2), held_out=verify)
+    if found.result is status.result:
+        return found
+    done = len(found.seen) >= config.minimum_scans and found.error_95_m <= config.required_error_m
+    return dc.replace(found.proposing(scene, plan), done=done)
 
 
 @dataclass(frozen=True, eq=False)

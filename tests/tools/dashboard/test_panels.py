@@ -14,8 +14,9 @@ from pydrake.math import RigidTransform
 
 from tests.browser import Browser
 from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.recorded_carried import HeldOutScan, NextBest
 from weldcal.systems.jobs.motion.procedure import MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.procedure import HeldOutScan, MountingState, MountingStatus, NextBest
+from weldcal.systems.jobs.mounting.procedure import MountingState, MountingStatus
 from weldcal.systems.jobs.profiler.estimates import TakenProfile
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState, Touched
