@@ -27,6 +27,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.features.bead_course import bead_course
 from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.recorded_carried import CarriedCalibration, HeldOutScan
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.calibration.verified_scans import PoseError
@@ -165,7 +166,7 @@ def motion() -> Made:
         seconds=1.0,
         out=OUT,
     )
-    return report.first, motion_report(report, dataset="moving")
+    return report.first, motion_report(report, "Calibration in motion of moving")
 
 
 def monitor() -> Made:
@@ -289,7 +290,7 @@ def mounting() -> Made:
         status=status,
         folder=OUT,
         seconds=5.0,
-        limit=(0.3, "calibration.required_error_mm"),
+        limit=(run.cell.scenario.calibration.required_error_mm, "calibration.required_error_mm"),
         description="A cell.",
         source=("scenario.yaml", ""),
         run=run,
