@@ -17,6 +17,8 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.writing import JOINTS, SECOND_JOINTS
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
+from weldcal.calibration.eye_on_base.validation import VerificationResult
+from weldcal.calibration.planning.calibration_poses import NextBest
 from weldcal.calibration.planning.mounting_estimate import (
     Circle,
     MountingResult,
@@ -48,40 +50,6 @@ _TRIED_AGAIN = 3  # scans
 _SAME = 1e-4  # m, and as a matrix: what a controller rounds
 
 
-@dataclass(frozen=True)
-class HeldOutScan:
-    """Errors of a calibration's prediction in a scan that it did not use."""
-
-    label: str
-    error_m: float
-    tilt_rad: float
-
-
-@dataclass(frozen=True)
-class NextBest:
-    """A pose to add: joints (6,) rad, X_BF of the first arm, and the sigma of a scanned point without and with it.
-
-    The sigma is 3-D, predicted, in m.
-    """
-
-    q: Array
-    q_2: Array | None
-    X_BF: RigidTransform
-    sigma_before_m: float
-    sigma_after_m: float
-
-    def sentence(self) -> str:
-        """Return the proposal as one sentence for the operator."""
-        joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.q))
-        second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
-        p = 1e3 * self.X_BF.translation()
-        return (
-            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would"
-            f" reduce the sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to"
-            f" {1e3 * self.sigma_after_m:.4f} mm."
-        )
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CarriedCalibration:
     """The calibration after its newest scan.
@@ -100,7 +68,7 @@ class CarriedCalibration:
     sigma_work_m: float = np.inf
     error_95_m: float = np.inf
     history: tuple[tuple[int, float], ...] = ()
-    held_out: tuple[HeldOutScan, ...] = ()
+    held_out: tuple[VerificationResult, ...] = ()
     next_best: NextBest | None = None
     message: str = ""
 
@@ -127,7 +95,7 @@ class CarriedCalibration:
             return self.refusing(id, str(error))
         if held_out:
             off = off_prediction(belief, seen, None if self.result is None else self.result.correction)
-            return replace(self, held_out=(*self.held_out, HeldOutScan(id, *off)))
+            return replace(self, held_out=(*self.held_out, VerificationResult(id, *off)))
         refused = tuple(row for row in self.refused if row[0] != id)
         found = replace(self, seen=(*self.seen, seen), refused=refused, message="")
         if len(found.seen) < fewest(scene):
@@ -155,7 +123,7 @@ class CarriedCalibration:
         belief = scene.believing(self.result.poses)
         after = expected_after(belief, self.result, self.seen, left)
         best, now = left[int(np.argmin(after))], expected_error(belief, self.result)[0]
-        proposed = NextBest(best.q, best.q_2, belief.frames(best.q)[FLANGE], now, float(after.min()))
+        proposed = NextBest(best.q, belief.frames(best.q)[FLANGE], now, float(after.min()), best.q_2)
         return replace(self, next_best=proposed)
 
 

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, InputPort
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.validation import VerificationResult as VerificationResult
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import LocalField
@@ -149,15 +150,6 @@ class FlangeEstimate(Message):
     arrival_time: float = -np.inf
     device_time: float | None = None
     center_expected_C: NDArray[np.float64] | None = None  # (3,) m
-
-
-@dataclass(frozen=True, eq=False)
-class VerificationResult(Message):
-    """Errors of the calibration at one held-out pose."""
-
-    label: str
-    error_m: float
-    tilt_rad: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -29,7 +29,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole, write_atomic
 
 ON_BASE = "eye_on_base"
-RESULT_FILE = "calibration.yaml"
+RESULT_FILE, KINEMATICS_FILE = "calibration.yaml", "kinematics.yaml"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,6 +197,14 @@ def pose_of_document(section: DocumentSection, refusal: str) -> RigidTransform:
         if section.has(key) and not np.allclose(section.array(key, len(own)), own, atol=1e-5):  # five printed decimals
             raise InputError(f"'{section.file}': {section.place}.matrix and {section.place}.{key} differ: change both.")
     return X
+
+
+def save_all(result: CalibrationResult, folder: Path, kinematics: str = "") -> None:
+    """Write the exports, the text of refined ``kinematics``, and last calibration.yaml: then everything is there."""
+    export_all(result, folder)
+    if kinematics:
+        write_atomic(folder / KINEMATICS_FILE, kinematics)
+    save_result(result, folder)
 
 
 def save_result(result: CalibrationResult, folder: Path) -> Path:

@@ -97,7 +97,7 @@ def test_the_next_best_pose_is_new_and_would_help(name: str) -> None:
     run = finished(name)
     best = run.status.next_best
     assert best is not None
-    assert best.sigma_after_m < best.sigma_before_m
+    assert best.after_m < best.before_m
     assert min(np.abs(best.q - s.pose.q).max() for s in run.status.seen) > np.radians(0.5)
     assert run.scene.seen(best.q, best.q_2).translation()[2] > 0.3  # before the scanner
 

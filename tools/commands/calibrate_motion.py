@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from weldcal.calibration.data.results import export_all, save_result
+from weldcal.calibration.data.results import save_all
 from weldcal.calibration.recorded_motion import RecordedMotion, calibrate_motion
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import check_limit
@@ -34,11 +34,9 @@ def calibrate_recording(
     report = MotionReport(**vars(found), seconds=time.monotonic() - started, out=out, limit_mm=limit_mm)
     progress("writing the report", 0.95)
     write_atomic(out / "report.html", motion_report(report, f"Calibration in motion of {folder.name}"))
-    export_all(report.result, out)
     if centres:
         write_atomic(out / "centres.csv", _centres_csv(found))
-    # last, so that its presence means that everything else is there
-    save_result(report.result, out)
+    save_all(report.result, out)
     return report
 
 

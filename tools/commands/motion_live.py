@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import export_all, save_result
+from weldcal.calibration.data.results import save_all
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
 from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
@@ -157,8 +157,7 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
         result = replace(found.result, seed=options.seed)
         known = vars(found) | {"result": result, "against": outcome.against, "no_tolerance": _NO_KEY}
         outcome = replace(outcome, report=MotionReport(**known, seconds=run.wall_seconds, out=options.out))
-        export_all(result, options.out)
-        save_result(result, options.out)
+        save_all(result, options.out)
     if added.recorder is not None:
         added.recorder.finish(posed_stream(record, finished.cell.station.arm), added.header)
     rows = [(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v]

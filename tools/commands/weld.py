@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import numpy as np
 import typer
 
-from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.header import Feature
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
+from weldcal.calibration.data.results import CalibrationResult, save_all
 from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result, write_apart
@@ -32,7 +30,7 @@ from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.cli.result_folder import writer
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, placed, run_job, run_options, save_scans
-from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
@@ -286,7 +284,9 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        write_calibration(run.cell, result.status, result.options.seed, folder)
+        if (calibrated := live_result(run.cell, result.status, result.options.seed)) is not None:
+            refinement = result.status.refinement
+            save_all(calibrated, folder, "" if refinement is None else refinement.kinematics)
         write_scans(run, result.status, folder / SCANS, result.robot)
         if result.record is not None:
             if result.record.own is not None and (result.broken or result.record.run > 1):
@@ -312,38 +312,23 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
     estimate, refinement = status.estimate, status.refinement
     if estimate is None:
         return None
-    scanner, rows = cell.scenario.scanner_config(), zip(status.observations, estimate.inliers, strict=True)
-    outliers = [(o.id, "it disagrees with the other poses") for o, keep in rows if not keep]
+    scanner = cell.scenario.scanner_config()
     return estimate_result(
         estimate,
         status.observations,
-        [*outliers, *status.refused],
+        status.refused,
         cell.job.X_FR,
         [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep],
-        held_out_mm=live_errors(1e3 * estimate.held_out.position_m),
-        tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
+        field=status.local_field,
+        kinematics="" if refinement is None else refinement.kinematics,
         warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
         robot=cell.scenario.arm,
         flange=cell.scenario.calibration.feature,
         scanner="" if scanner is None else scanner.scanner().name,
-        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
         scanner_correction=None if estimate.correction is None else estimate.correction.document(),
-        local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
         arm_errors=None if refinement is None else refinement.arm_errors,
-        kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
     )
-
-
-def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
-    """Write calibration.yaml and its exports for other tools, where there is a calibration."""
-    result = live_result(cell, status, seed)
-    if result is None:
-        return None
-    export_all(result, folder)
-    if status.refinement is not None and status.refinement.kinematics:
-        write_atomic(folder / KINEMATICS_FILE, status.refinement.kinematics)
-    return save_result(result, folder)
 
 
 def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:

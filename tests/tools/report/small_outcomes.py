@@ -27,7 +27,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.features.bead_course import bead_course
 from weldcal.calibration.profiler.record import ProfilerRecord
-from weldcal.calibration.recorded_carried import CarriedCalibration, HeldOutScan
+from weldcal.calibration.recorded_carried import CarriedCalibration
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.calibration.verified_scans import PoseError
@@ -281,7 +281,7 @@ def mounting() -> Made:
         sigma_work_m=2e-5,
         error_95_m=4e-5,
         history=((4, 4e-5), (9, 2e-5)),
-        held_out=(HeldOutScan("pose9", 1e-4, 1e-3),),
+        held_out=(VerificationResult("pose9", 1e-4, 1e-3),),
     )
     run = _run("eye_in_hand", truth={})
     run.cell.station = SimpleNamespace(truth=SimpleNamespace(scanner=None))
