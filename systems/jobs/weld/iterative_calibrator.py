@@ -30,12 +30,11 @@ def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_
     """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason.
 
     ``arm`` is the one that observed.
-
-    Live scans have no hole patterns.
     """
     if status.estimate is None or kind == PLAIN:
         return status
     steps = Steps(
+        patterns=status.patterns,
         correct_scanner=correct_scanner,
         refine=kind,
         arm=None if kind == "local" else chain_of(arm),
@@ -194,11 +193,12 @@ def digest(
     observation = observation_from_fit(seen.label, X_BR, seen.fit)
     observations = (*status.observations, observation)
     joints = status.joints if q is None else (*status.joints, q)
-    status = dc.replace(status, observations=observations, joints=joints)
+    patterns = status.patterns if seen.pattern is None else {**status.patterns, seen.label: seen.pattern}
+    status = dc.replace(status, observations=observations, patterns=patterns, joints=joints)
     try:
         if len(observations) < ENOUGH:
             raise TooFewPoses(f"{len(observations)} usable scans do not fix the scanner's pose; take {ENOUGH} or more.")
-        found = calibrate(observations, Steps(correct_scanner=config.correct_scanner))
+        found = calibrate(observations, Steps(patterns=patterns, correct_scanner=config.correct_scanner))
     except WeldcalError as error:
         return dc.replace(status, message=str(error))
     estimate = found.estimate
