@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -15,6 +15,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.checks import unit_quaternion
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.results import ON_BASE
 from weldcal.calibration.data.writing import JOINTS, SECOND_JOINTS
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.eye_on_base.validation import VerificationResult
@@ -33,7 +35,7 @@ from weldcal.calibration.planning.mounting_estimate import (
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE, FOOT, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import LINKS, known_arms, load_arm
+from weldcal.models.arms.kinematics import LINKS, ArmModel, known_arms, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange
@@ -223,24 +225,46 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
     second = header.second_robot
     if (second is not None) != (header.configuration == "co_manipulation"):
         raise InputError("co_manipulation, and it alone, has second_robot in dataset.yaml: its robot, xyz and wxyz.")
-    foot = base_circle(robot) if header.configuration in FOOT else None
-    standard = get_flange(flange) if foot is None else foot.standard
     first = data.joints()
+    q_home = np.median(list(first.values()), axis=0) if first else _HOME
+    named = replace(header, robot=robot, flange=flange)
+    known: dict[str, Any] = {"X_HR": data.X_FR}
+    if second is not None:
+        X_BD = RigidTransform(unit_quaternion(second.wxyz, "second_robot"), second.xyz)
+        known |= {"X_BD": X_BD, "q_home_2": _HOME}
+    return described_scene(named, load_arm(robot), guess, q_home, **known)
+
+
+def described_scene(
+    header: DatasetHeader, arm: ArmModel, X_LC: RigidTransform, q_home: Array, **more: Any
+) -> tuple[MountingScene, Circle]:
+    """Return the scene as a dataset's header describes it, and its circle.
+
+    ``X_LC``: the scanner on its carrier; ``more``: other fields of the scene, such as those of a second arm.
+    """
+    foot = base_circle(header.robot) if header.configuration in FOOT else None
+    standard = get_flange(header.flange) if foot is None else foot.standard
+    link = 1 + LINKS.index(header.scanner_link) if header.scanner_link else FLANGE
+    known = {
+        "X_HR": RigidTransform(),
+        "scanner": get_scanner(header.scanner or "phoxi_m"),
+        "arm_error_m": 1e-3 * header.arm_error_mm,
+        **more,
+        **({} if foot is None else {"X_HR": foot.X_BR}),
+    }
+    if header.second_robot is not None:
+        known["arm_2"] = load_arm(header.second_robot.robot)
     scene = MountingScene(
         configuration=header.configuration,
-        arm=load_arm(robot),
-        link=1 + LINKS.index(header.scanner_link) if on_arm else FLANGE,
-        X_LC=guess,
-        X_HR=data.X_FR if foot is None else foot.X_BR,
+        arm=arm,
+        link=BASE if header.configuration == ON_BASE else link,
+        X_LC=X_LC,
         radius_m=0.5 * standard.outer_m,
-        scanner=get_scanner(header.scanner or "phoxi_m"),
-        q_home=np.median(list(first.values()), axis=0) if first else _HOME,
-        arm_2=None if second is None else load_arm(second.robot),
-        X_BD=None if second is None else RigidTransform(unit_quaternion(second.wxyz, "second_robot"), second.xyz),
-        q_home_2=None if second is None else _HOME,
-        arm_error_m=1e-3 * header.arm_error_mm,
+        q_home=q_home,
+        **known,
     )
-    return scene, Circle(standard, header.scanner_guess.radius_m, foot is not None)
+    radius_m = 0.0 if header.scanner_guess is None else header.scanner_guess.radius_m
+    return scene, Circle(standard, radius_m, foot is not None)
 
 
 def recorded_joints(data: Dataset, scene: MountingScene) -> dict[str, Joints]:

@@ -116,7 +116,7 @@ def test_a_circle_of_unknown_place_leaves_its_turn_about_its_own_normal_open_and
 def test_the_first_joint_shows_the_foot_no_other_side() -> None:
     """The base circle turns about the first joint's own axis: a scanner on the arm sees the same, wherever that joint
     is."""
-    scene, _ = mounting_scene(ideal_short("eye_on_arm_base"), finished("eye_on_arm_base").scene.arm)
+    _, scene, _ = mounting_scene(ideal_short("eye_on_arm_base"), finished("eye_on_arm_base").scene.arm)
     q = scene.q_home
     turned = q + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     a, b = scene.seen(q), scene.seen(turned)

@@ -9,16 +9,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from weldcal.calibration.data.header import SecondRobot
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
-from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
 from weldcal.calibration.recorded_carried import calibrate_carried
-from weldcal.models.arms.kinematics import LINKS
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario, scenario_text
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, command
-from weldcal.tools.commands.run import JobRun, placed, run_job, run_options, save_scans
+from weldcal.tools.commands.run import JobRun, run_job, run_options, save_scans
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.mounting import MountingReport, mounting_report, station_picture
 from weldcal.tools.report.render import csv_text, write_atomic
@@ -114,30 +111,11 @@ def write_mounting(report: MountingReport, finished: JobRun | None = None) -> No
         write_atomic(folder / "station.png", picture)
     if finished is not None:
         write_atomic(folder / source, words)
-        write_scans(report)
+        X_BF = {s.label: s.observation.X_BF for s in report.status.seen}
+        joints = {s.label: s.pose.joints for s in report.status.seen}
+        save_scans(finished.run, folder / "scans", finished.cell.job.header, X_BF, joints)
         finished.write_recording(folder)
     write_atomic(folder / "report.html", mounting_report(report, picture))
-
-
-def write_scans(report: MountingReport) -> None:
-    """Write the scans of a live run's calibration as a dataset, scans/ in its folder, for `weldcal calibrate`."""
-    assert report.run is not None
-    scene, second = report.scene, None
-    if scene.arm_2 is not None and scene.X_BD is not None:
-        second = SecondRobot(robot=scene.arm_2.name, **placed(scene.X_BD))
-    save_scans(
-        report.run,
-        report.folder / "scans",
-        {s.label: s.observation.X_BF for s in report.status.seen},
-        {s.label: s.pose.joints for s in report.status.seen},
-        scene.X_LC,
-        flange=report.run.cell.scenario.flange_name(),
-        configuration=scene.configuration,
-        note="scans of a run",
-        scanner_link="" if scene.link in (BASE, FLANGE) else LINKS[scene.link - 1],
-        second_robot=second,
-        arm_error_mm=1e3 * scene.arm_error_m,
-    )
 
 
 def _observations(report: MountingReport) -> str:

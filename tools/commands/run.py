@@ -19,7 +19,7 @@ import typer
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
+from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.writing import save_dataset
 from weldcal.models.arrays import Array
 from weldcal.models.documents import nearest
@@ -189,27 +189,20 @@ def run_job(
 
 
 def save_scans(
-    run: Run[Any],
-    folder: Path,
-    poses: Mapping[str, RigidTransform],
-    joints: Mapping[str, Array],
-    guess: RigidTransform,
-    **header: Any,
+    run: Run[Any], folder: Path, header: DatasetHeader, poses: Mapping[str, RigidTransform], joints: Mapping[str, Array]
 ) -> Path | None:
     """Write the scans of a live calibration as a dataset for `weldcal calibrate`; None where there are none.
 
-    ``poses`` are X_BF by the scan's label, ``joints`` (n,) rad likewise; ``header``: fields of dataset.yaml that the
-    scenario does not state.
+    ``poses`` are X_BF by the scan's label, ``joints`` (n,) rad likewise.
     """
-    scenario, scanner, kept = run.cell.scenario, run.cell.scenario.scanner_config(), run.scans
+    scanner, kept = run.cell.scenario.scanner_config(), run.scans
     ids = [id for id in poses if id in kept]
     if not ids or scanner is None:
         return None
     preset = scanner.scanner()
-    near = ScannerGuess(**placed(guess), radius_m=1e-3 * scenario.calibration.guess_radius_mm)
     save_dataset(
         folder,
-        DatasetHeader(robot=scenario.arm, scanner=preset.name, scanner_guess=near, **header),
+        header,
         {id: poses[id] for id in ids},
         {id: kept[id][0].points_C.astype(float) for id in ids},
         times={id: kept[id][0].capture_time for id in ids},
@@ -217,11 +210,6 @@ def save_scans(
         intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
     )
     return folder
-
-
-def placed(X: RigidTransform) -> dict[str, list[float]]:
-    """Return a pose as the header of a dataset has it: xyz (m) and wxyz."""
-    return {"xyz": X.translation().tolist(), "wxyz": X.rotation().ToQuaternion().wxyz().tolist()}
 
 
 @contextmanager

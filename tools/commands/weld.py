@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from weldcal.calibration.data.header import Feature
+from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess, placed
 from weldcal.calibration.data.results import CalibrationResult, save_all
 from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
@@ -29,7 +29,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.cli.result_folder import writer
-from weldcal.tools.commands.run import RECORDED, JobRun, named_once, placed, run_job, run_options, save_scans
+from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options, save_scans
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import write_atomic, write_json
@@ -336,18 +336,20 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
 
     `robot` is the name of the robot, for the dataset's note.
     """
-    X_FR, scenario = run.cell.job.X_FR, run.cell.scenario
-    return save_scans(
-        run,
-        folder,
-        {o.id: o.X_BR @ X_FR.inverse() for o in status.observations},
-        {o.id: q for o, q in zip(status.observations, status.joints, strict=False)},
-        scenario.calibration.mounting_guess.pose(),
+    X_FR, scenario, scanner = run.cell.job.X_FR, run.cell.scenario, run.cell.scenario.scanner_config()
+    c = scenario.calibration
+    header = DatasetHeader(
+        robot=scenario.arm,
         flange=feature_standard(scenario).designation,
+        scanner="" if scanner is None else scanner.scanner().name,
         configuration="eye_on_base",
         note=f"rendered scans of a run; robot: {robot}",
         feature_in_flange=Feature(**placed(X_FR)),
+        scanner_guess=ScannerGuess(**placed(c.mounting_guess.pose()), radius_m=1e-3 * c.guess_radius_mm),
     )
+    poses = {o.id: o.X_BR @ X_FR.inverse() for o in status.observations}
+    joints = dict(zip(poses, status.joints, strict=False))
+    return save_scans(run, folder, header, poses, joints)
 
 
 def write_weld_log(record: WeldRecord, folder: Path) -> Path:

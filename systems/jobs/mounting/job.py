@@ -3,20 +3,22 @@
 import dataclasses as dc
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
+from weldcal.calibration.data.header import DatasetHeader, ScannerGuess, SecondRobot, placed
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
-from weldcal.calibration.planning.mounting_scene import FLANGE, FOOT, MountingScene
-from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
+from weldcal.calibration.planning.mounting_scene import MountingScene
+from weldcal.calibration.recorded_carried import described_scene
+from weldcal.models.arms.kinematics import LINKS, ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import base_circle
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.background import Answer, Background, BackgroundSystem
@@ -116,10 +118,11 @@ def digest(
 
 @dataclass(frozen=True, eq=False)
 class MountingPlanned:
-    """The scene as known before the first scan, the dimensions of the circle, and the poses to visit."""
+    """The header of the scans' dataset, the scene as known before the first scan, the circle, and the poses to visit."""
 
+    header: DatasetHeader
     scene: MountingScene
-    standard: FlangeStandard
+    circle: Circle
     poses: tuple[MountingPose, ...]
 
 
@@ -127,6 +130,7 @@ class MountingPlanned:
 class AddedMounting(AddedJob):
     """The systems of the job; `truth` (X, and Y or Z where they are estimated) is for reports and tests only."""
 
+    header: DatasetHeader
     scene: MountingScene
     plan: tuple[MountingPose, ...]
     scans: int
@@ -174,8 +178,8 @@ class MountingCalibrationJob(Job[MountingPlanned]):
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MountingPlanned:
         """See Job."""
-        scene, standard = mounting_scene(scenario, station.arm)
-        return MountingPlanned(scene, standard, plan_mounting(scenario, scene, seed))
+        header, scene, circle = mounting_scene(scenario, station.arm)
+        return MountingPlanned(header, scene, circle, plan_mounting(scenario, scene, seed))
 
     def add(self, wiring: Wiring, spine: Spine, plan: MountingPlanned) -> AddedMounting:
         """See Job."""
@@ -186,8 +190,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
             "mounting_procedure",
             MountingProcedure(plan.poses, c.maximum_scans, c.verification_scans, home, maximum_time_s=maximum_time_s),
         )
-        circle = Circle(plan.standard, c.guess_radius_mm * 1e-3, c.configuration in FOOT)
-        fit = MountingFitConfig(circle, c.minimum_scans, c.required_error_mm * 1e-3)
+        fit = MountingFitConfig(plan.circle, c.minimum_scans, c.required_error_mm * 1e-3)
         calibrator = wiring.add(
             "mounting_calibrator", MountingCalibrator(scene, fit, plan.poses, wiring.station.background)
         )
@@ -200,6 +203,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
             wiring.connect(procedure, settled_goal_2=second.settled_goal, robot_status_2=second.status)
         shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
         return AddedMounting(
+            header=plan.header,
             scene=scene,
             plan=plan.poses,
             scans=c.maximum_scans + c.verification_scans,
@@ -211,35 +215,33 @@ class MountingCalibrationJob(Job[MountingPlanned]):
         )
 
 
-def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """Return the scene as known before the first scan, from drawings and rough measurements.
+def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[DatasetHeader, MountingScene, Circle]:
+    """Return the header of a dataset of the run's scans, the scene as known before the first one, and the circle.
 
-    And the dimensions of the circle.
+    From drawings and rough measurements.
     """
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
-    carrier = scanner.mounted_on
-    link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
-    circle = base_circle(scenario.arm) if c.configuration in FOOT else None
-    standard = get_flange(scenario.flange_name()) if circle is None else circle.standard
-    second = job.second_arm
-    scene = MountingScene(
+    preset, guess, second = scanner.scanner(), c.mounting_guess.pose(), job.second_arm
+    header = DatasetHeader(
+        robot=scenario.arm,
+        flange=scenario.flange_name(),
+        scanner=preset.name,
         configuration=c.configuration,
-        arm=arm,
-        link=link,
-        X_LC=c.mounting_guess.pose(),
-        X_HR=RigidTransform() if circle is None else circle.X_BR,
-        radius_m=0.5 * standard.outer_m,
-        scanner=scanner.scanner(),
-        q_home=np.deg2rad(scenario.home_deg),
-        target_known=job.target_known,
-        arm_2=None if second is None else load_arm(second.arm),
-        X_BD=None if second is None else second.pose(),
-        q_home_2=None if second is None else np.deg2rad(second.home_deg),
-        surroundings=surroundings_of(scenario),
+        note="scans of a run",
+        scanner_guess=ScannerGuess(**placed(guess), radius_m=c.guess_radius_mm * 1e-3),
+        scanner_link=scanner.mounted_on if scanner.mounted_on in LINKS else "",
     )
-    return scene, standard
+    known: dict[str, Any] = {
+        "scanner": preset,
+        "target_known": job.target_known,
+        "surroundings": surroundings_of(scenario),
+    }
+    if second is not None:
+        header.second_robot = SecondRobot(robot=second.arm, **placed(second.pose()))
+        known |= {"X_BD": second.pose(), "q_home_2": np.deg2rad(second.home_deg)}
+    return header, *described_scene(header, arm, guess, np.deg2rad(scenario.home_deg), **known)
 
 
 def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[MountingPose, ...]:
