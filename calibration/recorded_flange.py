@@ -367,7 +367,7 @@ def _result(
         data_hashes=data.hashes,
         scanner_correction=None if found.correction is None else found.correction.document(),
         axis_turn_deg=_axis_turn(inliers, scans.seen.patterns, found.X_rigid) if turned else None,
-        field=None if refined is None else refined.field,
+        local_field=None if refined is None or refined.field is None else refined.field.document(),
         arm_errors=None if refined is None else refined.arm,
         kinematics="" if refined is None else refined.kinematics,
         **({} if scans.seen.fits else {"sigma_normal_deg": 0.0}),

@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from weldcal.calibration.data.results import save_all
 from weldcal.calibration.doctor.case import DoctorCase, write_case
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.recorded_flange import FlangeOptions, calibrate_flange
@@ -13,7 +12,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import Algorithm1Outcome, CalibrationReport, calibration_report
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import check_folder, csv_text, write_atomic
+from weldcal.tools.report.render import check_folder, csv_text, save_all, write_atomic
 
 
 def calibrate_dataset(

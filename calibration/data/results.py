@@ -199,14 +199,6 @@ def pose_of_document(section: DocumentSection, refusal: str) -> RigidTransform:
     return X
 
 
-def save_all(result: CalibrationResult, folder: Path, kinematics: str = "") -> None:
-    """Write the exports, the text of refined ``kinematics``, and last calibration.yaml: then everything is there."""
-    export_all(result, folder)
-    if kinematics:
-        write_atomic(folder / KINEMATICS_FILE, kinematics)
-    save_result(result, folder)
-
-
 def save_result(result: CalibrationResult, folder: Path) -> Path:
     """Write ``calibration.yaml`` in ``folder``; returns its path."""
     parent = "base" if result.configuration == ON_BASE else "flange"

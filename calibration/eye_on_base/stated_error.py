@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -25,9 +25,6 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-if TYPE_CHECKING:
-    from weldcal.calibration.refinement.local_field import LocalField
 
 FALSE_ALARM = 0.01  # of verifications of a good calibration that exceed the limit
 _DRAWS = 6_000  # the limit's own error is then 1 to 2 %
@@ -109,7 +106,6 @@ def estimate_result(
     X_FR: RigidTransform | None,
     joints: Sequence[Array],
     *,
-    field: LocalField | None = None,
     kinematics: str = "",
     **more: Any,
 ) -> CalibrationResult:
@@ -120,7 +116,6 @@ def estimate_result(
         refused: id and reason of each scan that cannot be used; the outliers' reasons are added.
         X_FR: the feature in the flange; None for poses of the feature.
         joints: joint angles of the inliers, rad, where they are known.
-        field: the local field that belongs to the estimate.
         kinematics: text of the refined kinematics' file.
         more: other fields of the result.
     """
@@ -144,7 +139,6 @@ def estimate_result(
         "sigma_position_mm": 1e3 * e.sigma_position_m,
         "sigma_normal_deg": float(np.degrees(e.sigma_normal_rad)),
         "software": software_version(),
-        "local_field": None if field is None else field.document(),
         "kinematics_file": KINEMATICS_FILE if kinematics else "",
         "joint_covariance": e.joint,
         "orientations": orientations_of(inliers, X_FR),

@@ -1,8 +1,10 @@
 """DriftMonitor: tests a calibration on streamed observations of the flange and says whether the scanner has moved."""
 
+from __future__ import annotations
+
 import copy
 import dataclasses as dc
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -12,7 +14,6 @@ from pydrake.systems.framework import BasicVector, Context, State
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerClock, ScannerCorrection, correction_from_document
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
-from weldcal.calibration.motion.drift.run_clock import HALF_S, RunClock, SeenMotion, followed, with_frame
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest, drift_config
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
@@ -20,6 +21,10 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
 from weldcal.systems.motion.buffers import PoseHistory
 
+if TYPE_CHECKING:
+    from weldcal.calibration.motion.drift.run_clock import RunClock
+
+_HALF_S = 0.01  # about a capture: its velocity
 _RECENT = 400  # frames that the view shows
 
 
@@ -39,7 +44,7 @@ class MonitoredCalibration:
     config: DriftConfig | None = None
 
     @staticmethod
-    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
+    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> MonitoredCalibration:
         """Return the monitored calibration of a result.
 
         ``delay_s`` is the usual delay of the scanner, where the result does not know its clock.
@@ -52,7 +57,7 @@ class MonitoredCalibration:
         return MonitoredCalibration(result.X_BC, result.covariance, correction, clock, delay_s, config)
 
     @staticmethod
-    def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> "MonitoredCalibration | None":
+    def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> MonitoredCalibration | None:
         """Return the calibration that a run has made; None until it is done."""
         e = status.estimate
         if e is None or not status.done:
@@ -210,6 +215,8 @@ def watched_frame(
     c, status = watch.watched, dc.replace(watch.status, sequence=estimate.sequence)
     if c is None or estimate.fit is None:
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
+    from weldcal.calibration.motion.drift.run_clock import SeenMotion, followed, with_frame
+
     waited = 0 if watch.clock is None else len(watch.clock.waiting)
     clock, done = followed(watch.clock, estimate, c.delay_s, c.clock), 1
     usable: tuple[FlangeEstimate, ...] = (estimate,)
@@ -275,11 +282,11 @@ def _tracked(
     if fit is None:
         return None
     time = _captured(c, estimate, clock)
-    X = [history.pose_at(arm, t) for t in (time - HALF_S, time, time + HALF_S)]
+    X = [history.pose_at(arm, t) for t in (time - _HALF_S, time, time + _HALF_S)]
     before, now, after = (None if x is None else (x @ X_FR).GetAsMatrix4() for x in X)
     if now is None or before is None or after is None:
         return None
-    rates = (after - before) / (2.0 * HALF_S)
+    rates = (after - before) / (2.0 * _HALF_S)
     p_C, n_C = c.correction.points(fit.center_C), c.correction.normals(fit.center_C, fit.normal_C)
     return TrackedFrame(
         id=str(estimate.sequence),

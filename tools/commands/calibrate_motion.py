@@ -3,12 +3,11 @@
 import time
 from pathlib import Path
 
-from weldcal.calibration.data.results import save_all
 from weldcal.calibration.recorded_motion import RecordedMotion, calibrate_motion
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
-from weldcal.tools.report.render import check_folder, csv_text, write_atomic
+from weldcal.tools.report.render import check_folder, csv_text, save_all, write_atomic
 
 
 def calibrate_recording(

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import save_all
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
 from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
@@ -18,7 +17,7 @@ from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.page import TableRows, page_html
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import save_all, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing, run_document
 
 _NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess, placed
-from weldcal.calibration.data.results import CalibrationResult, save_all
+from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result, write_apart
@@ -32,7 +32,7 @@ from weldcal.tools.cli.result_folder import writer
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options, save_scans
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import typed
-from weldcal.tools.report.render import write_atomic, write_json
+from weldcal.tools.report.render import save_all, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.tools.report.weld_record import part_record, run_log, weld_record
@@ -319,7 +319,7 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         status.refused,
         cell.job.X_FR,
         [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep],
-        field=status.local_field,
+        local_field=None if status.local_field is None else status.local_field.document(),
         kinematics="" if refinement is None else refinement.kinematics,
         warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
         robot=cell.scenario.arm,

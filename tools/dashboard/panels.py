@@ -105,8 +105,8 @@ def _motion(facts: Facts, moment: Moment) -> dict[str, Any]:
     lines = [("Flange found", f"in {len(record.seen)} of {len(record.seen) + len(record.refused)} frames")]
     if record.refused:
         lines.append(("Last refused", f"{record.refused[-1][0]}: {record.refused[-1][1]}"))
-    if isinstance(found, MotionCalibration) and found.found is not None:
-        held = 1e3 * float(np.nanmedian(found.found.estimate.held_out_m))
+    if isinstance(found, MotionCalibration) and found.estimate is not None:
+        held = 1e3 * float(np.nanmedian(found.estimate.held_out_m))
         lines.append(("Calibration", f"{held:.2f} mm median on frames that it did not use"))
     return {
         "heading": "Frames",

@@ -1,4 +1,4 @@
-"""Learns a scanner's clock from streamed frames of the flange while the arm moves, for a monitor that runs beside it."""
+"""Learns a scanner's clock from streamed frames of the flange while the arm moves, for a live monitor."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arms.chain import chain_of, chain_poses
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-
-HALF_S = 0.01
-"""About a capture: its velocity."""
 
 
 class StreamedFit(Protocol):
@@ -40,6 +37,7 @@ _FEWEST, _MOST = 12, 60  # frames
 _CERTAIN_S = 1e-3  # half of _CONFIRMED_S: two sigma of a learnt shift are what the test lets a known clock be wrong
 _CONFIRMED_S = 2e-3  # as far as the drift test lets a known clock be wrong
 _REST_M = 1e-4  # by which the feature moves in SEARCHED_S at rest
+_HALF_S = 0.01  # about a capture: its velocity
 _ROUNDS = 8
 
 
@@ -166,8 +164,8 @@ def _shift(clock: RunClock, frames: Sequence[StreamedFit], seen: SeenMotion) -> 
     spread = np.einsum("dkx,dkx->d", e[inside], e[inside])
     shift = float(shifts[inside][np.argmin(spread)])
     for _ in range(_ROUNDS):
-        before, now, after = seen.features(times + shift + np.array([-HALF_S, 0.0, HALF_S])[:, None])
-        v = (after - before) / (2.0 * HALF_S)
+        before, now, after = seen.features(times + shift + np.array([-_HALF_S, 0.0, _HALF_S])[:, None])
+        v = (after - before) / (2.0 * _HALF_S)
         e, v = q - now, v - v.mean(axis=0)
         e -= e.mean(axis=0)
         told = float(np.einsum("kx,kx", v, v))

@@ -13,6 +13,7 @@ from weldcal.calibration.data.clouds import save_cloud
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
 from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.frames import observed_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.recorded_motion import RecordedMotion, calibrate_frames
@@ -63,6 +64,11 @@ class MotionCalibration(Message):
     asked: int = 0
     found: RecordedMotion | None = None
     reason: str = ""
+
+    @property
+    def estimate(self) -> MotionEstimate | None:
+        """The estimate of what was found."""
+        return None if self.found is None else self.found.estimate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -118,7 +118,7 @@ def digest(
 
 @dataclass(frozen=True, eq=False)
 class MountingPlanned:
-    """The header of the scans' dataset, the scene as known before the first scan, the circle, and the poses to visit."""
+    """The header of the scans' dataset, the scene before the first scan, the circle, and the poses to visit."""
 
     header: DatasetHeader
     scene: MountingScene

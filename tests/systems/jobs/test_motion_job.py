@@ -77,9 +77,8 @@ def test_the_command_writes_the_result_with_its_clock() -> None:
 def test_the_job_finds_the_scanner_and_its_clock() -> None:
     run = a_run()
     assert run.reason is None
-    record, calibrated = run.cell.job.record(run.root), run.cell.job.calibration(run.root).found
-    assert calibrated is not None
-    found = calibrated.estimate
+    record, found = run.cell.job.record(run.root), run.cell.job.calibration(run.root).estimate
+    assert found is not None
     X_BC, p_B = run.cell.station.truth.X_BC, np.array([0.65, 0.0, 0.30])
     assert X_BC is not None
     off = found.X_BC @ (X_BC.inverse() @ p_B) - p_B
