@@ -34,7 +34,6 @@ REFINEMENTS = ("local", "joints", "links")
 PLAIN = "none"
 LIVE_KINDS = (PLAIN, *REFINEMENTS)
 """What `calibration.refine` of a scenario may be."""
-KINEMATICS_FILE = "kinematics.yaml"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -75,6 +75,30 @@ class PlannedPose:
     sigma_m: float
 
 
+@dataclass(frozen=True)
+class NextBest:
+    """A pose to add: joints (6,) rad, X_BF of the (first) arm, and ``what`` it reduces, m, without and with it."""
+
+    q: Array
+    X_BF: RigidTransform
+    before_m: float
+    after_m: float
+    q_2: Array | None = None
+    what: str = "sigma of a scanned point"
+
+    def sentence(self) -> str:
+        """Return the proposal as one sentence for the operator."""
+        joints, second = (
+            ", ".join(f"{v:.0f}" for v in np.degrees(q)) for q in (self.q, () if self.q_2 is None else self.q_2)
+        )
+        p = 1e3 * self.X_BF.translation()
+        return (
+            f"joints [{joints}] deg{f', second arm [{second}] deg' if second else ''} (flange at {p[0]:.0f},"
+            f" {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the {self.what} from"
+            f" {1e3 * self.before_m:.4f} to {1e3 * self.after_m:.4f} mm."
+        )
+
+
 def plan_calibration_poses(
     arm: Chain,
     X_FR: RigidTransform,
