@@ -28,13 +28,12 @@ from weldcal.models.errors import InputError
 
 if TYPE_CHECKING:
     from weldcal.calibration.refinement.local_field import LocalField
-    from weldcal.models.arms.chain import Chain
+    from weldcal.models.arms.kinematics import Chain
 
 REFINEMENTS = ("local", "joints", "links")
 PLAIN = "none"
 LIVE_KINDS = (PLAIN, *REFINEMENTS)
 """What `calibration.refine` of a scenario may be."""
-KINEMATICS_FILE = "kinematics.yaml"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,24 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.calibrate import KINEMATICS_FILE, REFINEMENTS, Calibration, Steps, calibrate, refine
+from weldcal.calibration.calibrate import REFINEMENTS, Calibration, Steps, calibrate, refine
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
-from weldcal.calibration.data.results import (
-    CalibrationResult,
-    export_all,
-    save_result,
-    software_version,
-    statistics,
-    tilt_summary,
-)
-from weldcal.calibration.doctor.case import FEWEST, DoctorCase, dataset_case, write_case
+from weldcal.calibration.data.results import CalibrationResult, statistics
+from weldcal.calibration.doctor.case import FEWEST, DoctorCase, dataset_case
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, FlangeScan, fit_flanges, require_flange
 from weldcal.calibration.eye_on_base.solve import SolveConfig
-from weldcal.calibration.eye_on_base.stated_error import estimate_result
+from weldcal.calibration.eye_on_base.stated_error import disagreeing, estimate_result
 from weldcal.calibration.eye_on_base.validation import Convergence, convergence, k_fold, sampling_advice
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -37,7 +30,6 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.models.files import write_atomic
 from weldcal.models.flanges import FlangeStandard, get_flange
 
 if TYPE_CHECKING:
@@ -164,20 +156,21 @@ def calibrate_flange(
     measured = scans.seen.observations
     found, agreement = _solve(scans, tell, examine)
     inliers = found.inliers(measured)
-    outliers, refused = _disagreeing(scans, found.estimate)
+    outliers = disagreeing(found.estimate, measured)
+    refused = (*scans.seen.refused, *outliers.items())
     tell("cross-validating", 0.75)
     curve, k_fold_mm = _held_out(scans, inliers)
     estimate, unconfirmed = _unconfirmed(scans, found, inliers)
     warnings = (*found.warnings, *found.estimate.warnings, *_warnings(scans, found, inliers, agreement), *unconfirmed)
     refined, case = found.refined, dataset_case(scans.data, scans.seen, scans.standard, scans.standard)
     return RecordedFlange(
-        result=_result(scans, replace(found, estimate=estimate), inliers, refused, warnings),
+        result=_result(scans, replace(found, estimate=estimate), inliers, warnings),
         estimate=estimate,
         observations=found.observations,
         scanner=found.scanner,
         seen=scans.seen,
         refused=refused,
-        outliers=outliers,
+        outliers=tuple(outliers),
         convergence=curve,
         k_fold_mm=k_fold_mm,
         advice=sampling_advice(estimate, found.observations),
@@ -186,16 +179,6 @@ def calibrate_flange(
         kinematics="" if refined is None else refined.kinematics,
         case=replace(case, asked="".join(unconfirmed)),
     )
-
-
-def save_flange(found: RecordedFlange, out: Path) -> None:
-    """Write calibration.yaml, its exports and the doctor's observations.csv; calibration.yaml last."""
-    export_all(found.result, out)
-    if found.kinematics:
-        write_atomic(out / KINEMATICS_FILE, found.kinematics)
-    if found.case is not None:
-        write_case(out, found.case)
-    save_result(found.result, out)
 
 
 def _find_flanges(folder: Path, asked: FlangeOptions, tell: Tell, known: dict[str, FlangeScan] | None) -> _Scans:
@@ -301,16 +284,6 @@ def _refining(scans: _Scans, steps: Steps, kind: str) -> Steps:
     return replace(steps, refine=kind, arm=arm, joints=q, note=note, correct_scanner=correct)
 
 
-def _disagreeing(scans: _Scans, estimate: CalibrationEstimate) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """Return the ids of the outliers, and all scans that are not used, each with its reason."""
-    rows = zip(scans.seen.observations, estimate.inliers, estimate.position_residuals_m, strict=True)
-    off = {o.id: 1e3 * error for o, keep, error in rows if not keep}
-    reasons = (
-        (id, f"Its centre disagrees by {mm:.1f} mm with the other poses; it is not used.") for id, mm in off.items()
-    )
-    return tuple(off), (*scans.seen.refused, *reasons)
-
-
 def _held_out(scans: _Scans, inliers: list[Observation]) -> tuple[Convergence, dict[str, float]]:
     """Return the errors on unused scans by the number of scans, and those of folds (mm)."""
     seed, correct = scans.asked.seed, scans.corrects and not scans.few
@@ -378,11 +351,7 @@ def _warnings(scans: _Scans, found: Calibration, inliers: list[Observation], agr
 
 
 def _result(
-    scans: _Scans,
-    found: Calibration,
-    inliers: list[Observation],
-    refused: tuple[tuple[str, str], ...],
-    warnings: tuple[str, ...],
+    scans: _Scans, found: Calibration, inliers: list[Observation], warnings: tuple[str, ...]
 ) -> CalibrationResult:
     """Return the contents of calibration.yaml."""
     estimate, refined, data = found.estimate, found.refined, scans.data
@@ -390,24 +359,21 @@ def _result(
     return estimate_result(
         estimate,
         scans.seen.observations,
-        refused,
+        scans.seen.refused,
         scans.X_FR,
         _angles(data, inliers),
-        held_out_mm=statistics(1e3 * estimate.held_out.position_m[estimate.inliers]),
-        tilt_deg=tilt_summary(estimate.held_out.tilt_rad[estimate.inliers]),
         warnings=warnings,
         robot=scans.robot,
         flange=scans.standard.designation,
         scanner=data.header.scanner,
-        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)) if scans.seen.fits else 0.0,
         seed=scans.asked.seed,
         data_hashes=data.hashes,
         scanner_correction=None if found.correction is None else found.correction.document(),
         axis_turn_deg=_axis_turn(inliers, scans.seen.patterns, found.X_rigid) if turned else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
         arm_errors=None if refined is None else refined.arm,
-        kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
-        software=software_version(),
+        kinematics="" if refined is None else refined.kinematics,
+        **({} if scans.seen.fits else {"sigma_normal_deg": 0.0}),
         # positions alone say nothing of the flange's orientation
         **({} if all(p.has_orientation for p in data.pairs) else {"orientations": None, "observed": None}),
     )

@@ -10,10 +10,10 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.bag import at_rest
-from weldcal.calibration.data.poses.listing import listing_of_array
+from weldcal.calibration.data.poses.listing import Listing, listing_of_array
 from weldcal.calibration.data.poses.lists import folder_lists, two_lists
 from weldcal.calibration.data.poses.names import mounting_name
-from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
+from weldcal.calibration.errors import DatasetError, InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.corners import poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
@@ -21,7 +21,7 @@ from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, with_scale
 from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
-from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs, recorded_lists
+from weldcal.calibration.hand_eye.pairs.files import NO_MOUNTING, PosePairs, read_pairs, recorded_lists
 from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.search import Picture
@@ -32,7 +32,8 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, sol
 from weldcal.calibration.motion import pose_streams
 from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose, VisibleVolume, next_pose, view_of
-from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
@@ -191,19 +192,37 @@ def _read(
             file, board, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics, known=known
         )
         return shots.pairs, None, shots
-    stated = replace(stated, decide=not asked.motions)
-    streams = None
+    if asked.motions:
+        return read_pairs(file, mounting=mounting, length=unit, stated=replace(stated, decide=False)), None, None
+    return *pairs_or_streams(file, mounting=mounting, unit=unit, stated=stated, usual="eye_in_hand"), None
+
+
+def pairs_or_streams(
+    file: Path, *, mounting: str | None, unit: str | None, stated: StatedForms, usual: str = ""
+) -> tuple[PosePairs, ClockOffset | None]:
+    """Read pairs as read_pairs does, or pair two recordings in motion, with the offset of their clocks.
+
+    Args:
+        usual: the mounting of recordings in motion where none is given; empty: it must be given.
+
+    Raises:
+        InputError: as read_pairs.
+    """
+    lists = None
     if pose_streams.is_stream_file(file):
-        if unit not in (None, "m") or asked.motions:
-            raise InputError("Two streams of poses are in metres; omit --unit and --as motions.")
-        streams = pose_streams.synchronise(
-            pose_streams.read_streams(file), mounting=mounting or "eye_in_hand", source=file.name
-        )
-    elif not asked.motions:
-        streams = _trajectories(file, mounting, stated)
-    if streams is not None:
-        return streams.pairs, streams, None
-    return read_pairs(file, mounting=mounting, length=unit, stated=stated), None, None
+        if unit not in (None, "m"):
+            raise InputError("Two streams of poses are in metres; omit --unit.")
+    elif (lists := _trajectories(file, stated)) is None:
+        return read_pairs(file, mounting=mounting, length=unit, stated=stated), None
+    mode = mounting_name(mounting or usual)
+    if not mode:
+        raise DatasetError(NO_MOUNTING.format(file.name))
+    streams = (
+        pose_streams.synchronise(pose_streams.read_streams(file), mounting=mode, source=file.name)
+        if lists is None
+        else pose_streams.synchronise_lists(*lists, mounting=mode, source=file.name)
+    )
+    return streams.pairs, streams
 
 
 def _solve_motions(pairs: PosePairs, equation: str, config: HandEyeConfig) -> _Solution:
@@ -261,8 +280,8 @@ def _apply_corners(
         found.problem = problem_of_pairs(found.pairs)
 
 
-def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
-    """Return the pairs of two recordings in motion of a folder; None where it holds none."""
+def _trajectories(path: Path, stated: StatedForms) -> tuple[Listing, Listing] | None:
+    """Return the robot's and the camera's recording in motion of a path; None where it holds none."""
     lists = recorded = recorded_lists(path, stated)
     if lists is None and (not path.is_dir() or (path / "pairs.npz").exists()):
         return None
@@ -270,17 +289,11 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Cloc
         lists = lists or two_lists(folder_lists(path), path.name, stated.robot_poses, stated.camera_poses)
     except InputError:
         return None  # the reader of pairs says what is wrong
-    if recorded is not None and at_rest(*recorded) is not None:
+    if (recorded is not None and at_rest(*recorded) is not None) or not pose_streams.are_trajectories(*lists):
         return None
-    if not pose_streams.are_trajectories(*lists):
-        return None
-    forms = (stated.robot, stated.camera)
-    robot, camera = (
-        one.of_arm(stated.arm).stated(form, f"--as {who}-form")
-        for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
-    )
-    return pose_streams.synchronise_lists(
-        robot, camera, mounting=mounting_name(mounting or "eye_in_hand"), source=path.name
+    robot, camera = lists
+    return robot.of_arm(stated.arm).stated(stated.robot, "--as robot-form"), camera.stated(
+        stated.camera, "--as camera-form"
     )
 
 

@@ -18,8 +18,8 @@ from weldcal.calibration.data.scanner_correction import clock_from_document, cor
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.models.arms.chain import chain_forward, is_urdf, load_chain
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.chain import is_urdf, load_chain
+from weldcal.models.arms.kinematics import forward_kinematics, known_arms, load_arm
 from weldcal.models.arms.shape import BodyShape, arm_shape, urdf_shape
 from weldcal.models.arrays import Array
 from weldcal.models.documents import did_you_mean, read_document
@@ -117,7 +117,7 @@ def overlay(result: Path, dataset: Path, scan: str | None = None, robot: str | N
         X_BF, q = data.poses[id], None if angles is None else angles[0]
     if q is None and robot is not None:
         raise InputError(f"{_NO_JOINTS}, by which --robot places the links: add them, or omit --robot.")
-    reached = X_BF if q is None else chain_forward(load_chain(name, kinematics), q)
+    reached = X_BF if q is None else forward_kinematics(load_chain(name, kinematics), q)
     if (off := float(np.linalg.norm(reached.translation() - X_BF.translation()))) > _SAME_M:
         raise InputError(
             f"The joint angles of scan '{id}' put the flange of '{Path(name).name}' {1e3 * off:.0f} mm from its"

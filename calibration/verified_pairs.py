@@ -11,14 +11,14 @@ from weldcal.calibration.data.stated_pose import StatedPose, read_stated_pose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.exports import digest
 from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
-from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pairs.judging import Judgement, judge_pose
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.sets import read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.recorded_hand_eye import problem_of_pairs
+from weldcal.calibration.recorded_hand_eye import pairs_or_streams, problem_of_pairs
 
 _MOUNTINGS = ("eye_in_hand", "eye_on_base")
 
@@ -124,7 +124,7 @@ def verify_pairs(result: Path, pairs: Path, asked: PairsOptions | None = None) -
 def _read(path: Path, mode: str | None, asked: PairsOptions) -> tuple[PosePairs, HandEyeResult | None]:
     """Return the pairs in a mounting; of pictures with their own solution."""
     if asked.board is None:
-        return read_pairs(path, mounting=mode, length=asked.unit, stated=asked.stated), None
+        return pairs_or_streams(path, mounting=mode, unit=asked.unit, stated=asked.stated)[0], None
     what, config = parse_board(asked.board), HandEyeConfig(seed=asked.seed)
     shots = read_pictures(path, what, mounting=mode, unit=asked.unit, stated=asked.stated, camera=asked.intrinsics)
     # an estimated camera moves all pictures alike: only the adjustment of the corners knows by how much

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
 
-from weldcal.models.arms.chain import Chain, is_urdf, load_chain
+from weldcal.models.arms.chain import is_urdf, load_chain
+from weldcal.models.arms.kinematics import LINKS, Chain
 from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
@@ -42,8 +43,6 @@ def base_circle(arm: str) -> BaseCircle:
 
 
 ISO_50, ISO_80 = "iso9409-1-50-4-m6", "iso9409-1-80-6-m8"
-CLOSED_FORM, NUMERIC = "closed form", "numeric"
-"""How joint angles are found: every solution (arms.inverse), or one by iteration (arms.chain)."""
 
 FACTS = ("flange", "dowel", "payload", "reach", "repeatability", "joint limits", "kinematics", "TCP")
 """What is stated of a robot, each with its source."""
@@ -63,7 +62,6 @@ class Robot:
         reach_m: the maker's working radius.
         repeatability_m: of the pose, by ISO 9283.
         tcp: where its TCP is read.
-        inverse: how its joint angles are found.
         sources: document and section by entry of FACTS.
     """
 
@@ -76,7 +74,6 @@ class Robot:
     reach_m: float
     repeatability_m: float | None
     tcp: str
-    inverse: str
     sources: Mapping[str, str]
 
     @property
@@ -84,6 +81,11 @@ class Robot:
         """The flange to look for. Its dowel hole is at 90 degrees for every robot: a calibration's axis turn is
         measured from there."""
         return get_flange(self.flange)
+
+    @property
+    def inverse(self) -> str:
+        """Which joint angles `inverse_kinematics` finds."""
+        return "all" if self.joints == len(LINKS) else "some"
 
     @property
     def chain(self) -> Chain:
@@ -148,7 +150,6 @@ def _ur(
         reach_m=reach,
         repeatability_m=repeatability,
         tcp="pendant: Installation > General > TCP; RTDE: tcp_offset",
-        inverse=CLOSED_FORM,
         sources=stated,
     )
 
@@ -165,7 +166,6 @@ def _franka(name: str, title: str, **sources: str) -> Robot:
         reach_m=0.855,
         repeatability_m=1e-4,
         tcp="libfranka: F_T_EE of RobotState",
-        inverse=NUMERIC,
         sources=sources
         | {
             "kinematics": "franka_description, robots/fer/kinematics.yaml; FCI documentation, Denavit-Hartenberg"
@@ -256,7 +256,6 @@ ROBOTS: dict[str, Robot] = {
             reach_m=0.8865,
             repeatability_m=5e-5,
             tcp="",
-            inverse=NUMERIC,
             sources={
                 "flange": _SCANS,
                 "dowel": f"{_SCANS}; aubo_description, meshes/aubo_i5/visual/link6.DAE",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,9 @@ from pydrake.systems.framework import Context, InputPort
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.validation import VerificationResult as VerificationResult
 from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
@@ -143,21 +146,13 @@ class FlangeEstimate(Message):
     purpose: str = ""
     label: str = ""
     fit: FlangeFit | None = None
+    pattern: HolePattern | None = None
     points_C: NDArray[np.float64] | None = None  # face points around the fit, for verification and the viewer
     reason: str | None = None  # why there is no fit
     # of a streamed scan, whose capture_time is what was believed when it was fitted
     arrival_time: float = -np.inf
     device_time: float | None = None
     center_expected_C: NDArray[np.float64] | None = None  # (3,) m
-
-
-@dataclass(frozen=True, eq=False)
-class VerificationResult(Message):
-    """Errors of the calibration at one held-out pose."""
-
-    label: str
-    error_m: float
-    tilt_rad: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,6 +180,7 @@ class CalibrationStatus(Message):
     sequence: int = 0  # of the newest processed scan
     calibration_scans: int = 0
     observations: tuple[Observation, ...] = ()
+    patterns: Mapping[str, HolePattern] = field(default_factory=dict)  # by the observation's id, where one shows
     refused: tuple[tuple[str, str], ...] = ()
     estimate: CalibrationEstimate | None = None
     # expected error of a point at the work point, from the estimate's own covariance and noise

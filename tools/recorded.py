@@ -7,12 +7,12 @@ from pathlib import Path
 
 from weldcal.calibration.doctor.case import DoctorCase, write_case
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.recorded_flange import FlangeOptions, calibrate_flange, save_flange
+from weldcal.calibration.recorded_flange import FlangeOptions, calibrate_flange
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import Algorithm1Outcome, CalibrationReport, calibration_report
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.render import check_folder, csv_text, write_atomic
+from weldcal.tools.report.render import check_folder, csv_text, save_all, write_atomic
 
 
 def calibrate_dataset(
@@ -56,7 +56,9 @@ def calibrate_dataset(
     write_atomic(out / "report.html", calibration_report(report, dataset=folder.name))
     if centres:
         write_atomic(out / "centres.csv", _centres_csv(found.seen.observations))
-    save_flange(found, out)  # last, so that its presence means that everything else is there
+    if found.case is not None:
+        write_case(out, found.case)
+    save_all(found.result, out, found.kinematics)
     tell("done", 1.0)
     return replace(report, seconds=time.monotonic() - started)
 

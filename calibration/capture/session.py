@@ -65,7 +65,7 @@ class ArmPose:
         return known[len(self.numbers)]
 
     def moved(self, other: ArmPose) -> tuple[float, float]:
-        """How far another pose lies from it, m and rad; of numbers only whether they are the same (0, else infinite)."""
+        """How far another pose lies from it, m and rad; of typed numbers 0 or infinite."""
         if self.X_BF is None or other.X_BF is None:
             away = 0.0 if self.numbers == other.numbers else np.inf
             return away, away
@@ -77,7 +77,7 @@ class ArmPose:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
-    """One scan or picture with its pose. ``found``: what was found in it, to be drawn; ``refused``: why it is left out."""
+    """One scan or picture with its pose, what was found in it, and why it is left out ("": it counts)."""
 
     id: str
     file: Path
@@ -97,7 +97,7 @@ class Advice:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Verdict:
+class CaptureVerdict:
     """What the captures say together.
 
     ``X`` the scanner's or camera's pose (None: not yet), its error at the work point with 95 %, what is still open or
@@ -112,7 +112,7 @@ class Verdict:
     advice: Advice | None = None
 
 
-class Task(Protocol):
+class CaptureTask(Protocol):
     """What is captured: it looks at one file, and calibrates from the folder."""
 
     symbol: str
@@ -130,10 +130,10 @@ class Task(Protocol):
     def forget(self, id: str) -> None:
         """Drop what was found in a capture."""
 
-    def fresh(self) -> Task:
+    def fresh(self) -> CaptureTask:
         """Return the same task, with nothing found yet."""
 
-    def solve(self, folder: Path, last: ArmPose) -> Verdict:
+    def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """Calibrate. Raises WeldcalError as the command of this folder does."""
 
     def command(self, folder: Path) -> str:
@@ -146,16 +146,16 @@ class Task(Protocol):
         """Return the errors m of the captures in ``checks`` by the result that was saved. Raises WeldcalError."""
 
 
-class Session:
+class CaptureSession:
     """A folder of captures that grows: each is whole on disk before the next begins, and a new start goes on with it.
 
     A capture is its file, and then its row in the table of poses; a file without a row is not a capture.
     """
 
-    def __init__(self, folder: Path, task: Task) -> None:
+    def __init__(self, folder: Path, task: CaptureTask) -> None:
         self.folder, self.task = folder, task
         self.captures: list[Capture] = []
-        self._checks: Session | None = None
+        self._checks: CaptureSession | None = None
         (folder / task.folder).mkdir(parents=True, exist_ok=True)
         rows = self._rows()
         files = {cloud_id(p): p for p in (folder / task.folder).iterdir() if not p.name.startswith(".")}
@@ -207,21 +207,21 @@ class Session:
         one.file.unlink(missing_ok=True)
         self.task.forget(id)
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> CaptureVerdict:
         """Return what the captures say together: the calibration of this folder, as its command gives it."""
         if len(self.captures) < LEAST:
             need = LEAST - len(self.captures)
-            return Verdict(
+            return CaptureVerdict(
                 symbol=self.task.symbol, said=(f"{need} more capture{'s' * (need > 1)} for a first estimate.",)
             )
         try:
             return self.task.solve(self.folder, self.captures[-1].pose)
         except WeldcalError as refusal:
-            return Verdict(symbol=self.task.symbol, said=(str(refusal),))
+            return CaptureVerdict(symbol=self.task.symbol, said=(str(refusal),))
 
     def check(self, source: Path, pose: ArmPose, after: ArmPose | None = None) -> tuple[Capture, float]:
         """Judge the result in use by a capture that it never saw; returns it, and its error (m; NaN where refused)."""
-        self._checks = self._checks or Session(self.folder / CHECKS, self.task.fresh())
+        self._checks = self._checks or CaptureSession(self.folder / CHECKS, self.task.fresh())
         one = self._checks.take(source, pose, after)
         if one.refused:
             return one, np.nan

@@ -14,10 +14,21 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import cKDTree
 
-from weldcal.calibration.capture.session import LEAST, POSES_FILE, RESULT, Advice, ArmPose, Capture, Task, Verdict, jog
+from weldcal.calibration.capture.session import (
+    LEAST,
+    POSES_FILE,
+    RESULT,
+    Advice,
+    ArmPose,
+    Capture,
+    CaptureTask,
+    CaptureVerdict,
+    jog,
+)
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import FlangeScan, fit_flanges, flange_scan
@@ -28,7 +39,7 @@ from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
 from weldcal.calibration.planning.calibration_poses import predicted_sigma
-from weldcal.calibration.recorded_flange import calibrate_flange, save_flange
+from weldcal.calibration.recorded_flange import calibrate_flange
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
 from weldcal.calibration.verified_scans import verify_scans
 from weldcal.models.arms.inverse import nearest_solution
@@ -61,13 +72,13 @@ class FlangeTask:
         self._X_BC: RigidTransform | None = None
 
     def prepare(self, folder: Path) -> None:
-        """See Task."""
+        """See CaptureTask."""
         document = {"schema": 1, "configuration": "eye_on_base", "flange": self._standard.designation}
         document |= {"units": {"clouds": "auto", "poses": "auto"}, "poses": {"file": POSES_FILE}}
         write_atomic(folder / "dataset.yaml", yaml_dump(document | ({"robot": self._robot} if self._robot else {})))
 
     def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
-        """See Task."""
+        """See CaptureTask."""
         try:
             points = to_metres(read_cloud(path).astype(float), AUTO, path.name)
         except CloudError as refusal:
@@ -78,13 +89,13 @@ class FlangeTask:
         fit = found[0]
         if fit.coverage < _EDGE_SEEN:
             return fit, (
-                f"Only {100 * fit.coverage:.0f} % of the flange's edge is in the scan: bring it whole into the scanner's"
-                " view, with nothing before it."
+                f"Only {100 * fit.coverage:.0f} % of the flange's edge is in the scan: bring it whole into the"
+                " scanner's view, with nothing before it."
             )
         return fit, ""
 
     def contradicts(self, one: Capture, other: Capture) -> str:
-        """See Task."""
+        """See CaptureTask."""
         a, b = one.pose.X_BF, other.pose.X_BF
         if a is None or b is None or not isinstance(one.found, FlangeFit) or not isinstance(other.found, FlangeFit):
             return ""
@@ -94,20 +105,20 @@ class FlangeTask:
             return ""
         return (
             f"Since {one.id} the flange moved by {1e3 * robot:.0f} mm at the robot and by {1e3 * shown:.0f} mm in the"
-            " scans: the pose or the scan is an older one, the pose is not in its unit, or it is not the flange's (a TCP"
-            " is set at the robot)."
+            " scans: the pose or the scan is an older one, the pose is not in its unit, or it is not the flange's (a"
+            " TCP is set at the robot)."
         )
 
     def forget(self, id: str) -> None:
-        """See Task."""
+        """See CaptureTask."""
         self._known.pop(id, None)
 
-    def fresh(self) -> Task:
-        """See Task."""
+    def fresh(self) -> CaptureTask:
+        """See CaptureTask."""
         return FlangeTask(self._robot, self._standard.designation)
 
-    def solve(self, folder: Path, last: ArmPose) -> Verdict:
-        """See Task."""
+    def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
+        """See CaptureTask."""
         try:
             found = calibrate_flange(folder, known=self._known)
         except WeldcalError as refusal:
@@ -116,7 +127,7 @@ class FlangeTask:
             with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
                 X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
                 advice = self._next(seen.observations, seen.data or data, X_BC, last)
-                return Verdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
+                return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
             raise
         estimate, used = found.estimate, found.inliers
         self._X_BC = estimate.X_BC
@@ -125,7 +136,7 @@ class FlangeTask:
         odd = tuple((id, reason) for id, reason in found.refused if id in found.outliers)
         said = (*found.result.unobservable, *found.result.warnings, *found.advice)
         advice = None if found.seen.data is None else self._next(used, found.seen.data, estimate.X_BC, last)
-        return Verdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
+        return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
 
     def _next(self, seen: Sequence[Observation], data: Dataset, X_BC: RigidTransform, last: ArmPose) -> Advice | None:
         """Return the pose that lowers the error at the work point most, of those before the scanner within reach."""
@@ -147,16 +158,18 @@ class FlangeTask:
         return None
 
     def command(self, folder: Path) -> str:
-        """See Task."""
+        """See CaptureTask."""
         return f"weldcal calibrate {shlex.quote(str(folder))}"
 
     def save(self, folder: Path) -> None:
-        """See Task."""
+        """See CaptureTask."""
+        result = calibrate_flange(folder, known=self._known).result
         (folder / RESULT).mkdir(exist_ok=True)
-        save_flange(calibrate_flange(folder, known=self._known), folder / RESULT)
+        export_all(result, folder / RESULT)
+        save_result(result, folder / RESULT)
 
     def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
-        """See Task."""
+        """See CaptureTask."""
         return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder / RESULT, checks).poses]
 
 
@@ -171,12 +184,12 @@ class BoardTask:
         self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
 
     def prepare(self, folder: Path) -> None:
-        """See Task."""
+        """See CaptureTask."""
         if self._intrinsics is not None:
             shutil.copyfile(self._intrinsics, folder / self._intrinsics.name)
 
     def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
-        """See Task."""
+        """See CaptureTask."""
         grey = load_grey(path)
         if grey is None:
             return None, f"'{path.name}' cannot be read as a picture."
@@ -197,13 +210,13 @@ class BoardTask:
         width = _edge_px(grey, points[seen], gap)
         if width > _SHARP_PX:
             return picture, (
-                f"The picture is blurred: edges are {width:.0f} px wide. Let the arm rest, focus the camera, or expose for"
-                " a shorter time."
+                f"The picture is blurred: edges are {width:.0f} px wide. Let the arm rest, focus the camera, or expose"
+                " for a shorter time."
             )
         return picture, ""
 
     def contradicts(self, one: Capture, other: Capture) -> str:
-        """See Task."""
+        """See CaptureTask."""
         if not isinstance(one.found, Picture) or not isinstance(other.found, Picture):
             return ""
         moved_px = float(np.nanmedian(np.linalg.norm(one.found.points - other.found.points, axis=1)))
@@ -216,16 +229,16 @@ class BoardTask:
         return ""
 
     def forget(self, id: str) -> None:
-        """See Task."""
+        """See CaptureTask."""
         for name in [name for name in self._known if Path(name).stem == id]:
             del self._known[name]
 
-    def fresh(self) -> Task:
-        """See Task."""
+    def fresh(self) -> CaptureTask:
+        """See CaptureTask."""
         return BoardTask(self._text, self._mounting, self._robot or "", self._intrinsics)
 
-    def solve(self, folder: Path, last: ArmPose) -> Verdict:
-        """See Task."""
+    def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
+        """See CaptureTask."""
         asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
         found = calibrate_recorded(folder, asked, known=self._known)
         result, step = found.result, found.next_pose
@@ -242,19 +255,19 @@ class BoardTask:
                 X_BF=step.X_BF, words=words, sigma_before_m=step.sigma_before, sigma_after_m=step.sigma_after
             )
         said = (*result.unobservable, *result.warnings)
-        return Verdict(symbol=self.symbol, said=said, X=X, error_95_m=error, odd=odd, advice=advice)
+        return CaptureVerdict(symbol=self.symbol, said=said, X=X, error_95_m=error, odd=odd, advice=advice)
 
     def command(self, folder: Path) -> str:
-        """See Task."""
+        """See CaptureTask."""
         words = f"weldcal hand-eye ax-yb {shlex.quote(str(folder))} --board {shlex.quote(self._text)}"
         return f"{words} --mounting {self._mounting}{f' --robot {self._robot}' if self._robot else ''}"
 
     def save(self, folder: Path) -> None:
-        """See Task."""
+        """See CaptureTask."""
         raise InputError(f"Write the result with: {self.command(folder)}")
 
     def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
-        """See Task."""
+        """See CaptureTask."""
         raise InputError("New pictures are judged by: weldcal verify.")
 
 

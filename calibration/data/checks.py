@@ -1,6 +1,5 @@
 """Read dataset.yaml and CSV tables, and check them: rows, numbers, quaternions and units; hashes of files."""
 
-import csv
 import math
 import re
 from collections.abc import Iterator
@@ -32,13 +31,13 @@ from weldcal.models.files import (
     sha256,
 )
 from weldcal.models.flanges import is_part_file
+from weldcal.models.text_tables import LONGEST_CELL, cells_of, lines_of, separator_of
 
 Row = dict[str, str]
 Angles = dict[str, dict[str, float]]
 
 JOINT_NAME = re.compile(r"(second_)?q[1-7]")
 """Columns of joint angles, rad, in this package's own tables."""
-_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 AUTO = "auto"
@@ -59,8 +58,8 @@ REACH_M = (0.01, 10.0)
 def read_rows(path: Path) -> tuple[list[str], list[Row]]:
     """Names of the columns (lower case) and the rows by name, all stripped; a cell that is missing is empty.
 
-    The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #,
-    empty lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing.
+    Lines that begin with #, empty lines and rows without a value are skipped. Decimal commas become points where the
+    comma separates nothing.
     Raises InputError: no regular file, no UTF-8 text, larger than the bounds in models/files.py, a column named twice,
     a row with more values than columns, a quote that does not end; with the line's number.
     """
@@ -113,30 +112,15 @@ def _cells(path: Path) -> Iterator[tuple[int, list[str]]]:
 
     Raises InputError as read_rows.
     """
-    lines = [
-        (number, line)
-        for number, line in enumerate(re.split(r"\r\n|\n|\r", read_text(path)), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not lines:
-        return
-    begin = lines[0][1]
-    separator = max(",;\t", key=begin.count)
-    if separator not in begin and len(begin.split()) > 1:
-        separator, lines = " ", [(number, " ".join(line.split())) for number, line in lines]
-    reader = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True, strict=True)
-    line = lines[0][0]
-    try:
-        for cells in reader:
-            line = lines[reader.line_num - 1][0]
-            values = [cell.strip() for cell in cells]
-            if separator != ",":
-                values = [v.replace(",", ".") if _DECIMAL_COMMA.fullmatch(v) else v for v in values]
-            yield line, values
-    except csv.Error as e:
-        number = lines[min(reader.line_num, len(lines) - 1)][0]
-        what = "has a cell of more than 131072 characters" if "field larger" in str(e) else f"cannot be read ({e})"
-        raise InputError(f"'{path.name}', line {max(line, number)}, {what}.") from e
+    lines = list(lines_of(read_text(path), ("#",)))
+    separator = separator_of([line for _, line in lines])
+    for number, line in lines:
+        cells = cells_of(line, separator)
+        if len(line) > LONGEST_CELL and max(map(len, cells)) > LONGEST_CELL:
+            raise InputError(f"'{path.name}', line {number}, has a cell of more than {LONGEST_CELL} characters.")
+        if any(cell.startswith('"') for cell in cells):
+            raise InputError(f"'{path.name}', line {number}, cannot be read: a quote does not end.")
+        yield number, cells
 
 
 def _names(path: Path, cells: list[str]) -> list[str]:
@@ -255,13 +239,19 @@ def cloud_form(header: DatasetHeader, folder: Path) -> CloudForm:
     )
 
 
-def is_motion(folder: Path) -> bool:
-    """Return whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+def header_of(folder: Path) -> DatasetHeader | None:
+    """Return what a folder's dataset.yaml states; None where there is none, or none that can be read."""
     path = Path(folder) / "dataset.yaml"
     try:
-        return path.is_file() and read_header(path).mode == "motion"
+        return read_header(path) if path.is_file() else None
     except DatasetError:
-        return False
+        return None
+
+
+def is_motion(folder: Path) -> bool:
+    """Return whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+    header = header_of(folder)
+    return header is not None and header.mode == "motion"
 
 
 def is_carried(folder: Path) -> bool:
@@ -269,11 +259,7 @@ def is_carried(folder: Path) -> bool:
 
     False where it cannot be read.
     """
-    path = Path(folder) / "dataset.yaml"
-    try:
-        header = read_header(path) if path.is_file() else None
-    except DatasetError:
-        return False
+    header = header_of(folder)
     return header is not None and header.mode != "motion" and header.configuration != CONFIGURATIONS[0]
 
 

@@ -1,7 +1,8 @@
 """Reads point clouds from PLY, PCD, NPZ, NPY and text files and depth images; refuses damaged ones with a reason."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, decoded, read_text, write_npz
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
 __all__ = [
     "NO_NOTES",
@@ -36,18 +38,9 @@ __all__ = [
     "save_cloud",
 ]
 
-_TEXT = (".csv", ".txt", ".xyz", ".pts", ".asc")
-_PLAIN = (".ply", ".pcd", ".npz", ".npy", *_TEXT)
-_PACKED = (".ply.gz", ".pcd.gz", *(f"{s}.gz" for s in _TEXT))
-SUFFIXES = (*_PLAIN, *_PACKED, *IMAGES)
-_NOTES = (".csv", ".txt", ".csv.gz", ".txt.gz", *IMAGES)
-NO_NOTES = tuple(
-    s for s in SUFFIXES if s not in _NOTES
-)  # such a file beside the clouds is a cloud, not somebody's notes or pictures
 _MIN_POINTS = 30
 _ROWS = 50_000  # converted at a time
-_LINE = re.compile(r"[^\r\n]+")
-_COMMA_DECIMAL = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_ROWS_TO_SEPARATE = 50
 _WHOLE = re.compile(r"[+-]?\d+")
 _LONGEST_NUMBER = 100  # characters
 
@@ -55,7 +48,7 @@ _LONGEST_NUMBER = 100  # characters
 def ending_of(path: Path) -> str:
     """Return the ending of a cloud's file, one of SUFFIXES; the name's last one for another file."""
     name = path.name.lower()
-    return next((s for s in _PACKED if name.endswith(s)), path.suffix.lower())
+    return next((s for s in SUFFIXES if s.endswith(".gz") and name.endswith(s)), path.suffix.lower())
 
 
 def cloud_id(path: Path) -> str:
@@ -172,7 +165,7 @@ def _read_npz(path: Path, form: CloudForm) -> Array:
     return back_projected(depth, values)
 
 
-def read_text_cloud(path: Path) -> Array:
+def read_text_cloud(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
 
     A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal
@@ -181,45 +174,42 @@ def read_text_cloud(path: Path) -> Array:
     Raises:
         CloudError: anything else, with the line's number. InputError: the file cannot be opened, or is not UTF-8.
     """
-    rows = _rows(_text(path))
-    first = next(rows, None)
+    lines = lines_of(_text(path), ("#", "//"))
+    rows = ((number, row) for number, line in lines if (row := line.rstrip(",; \t")))
+    begin = list(islice(rows, _ROWS_TO_SEPARATE))
     promised = None
-    if first is not None and _WHOLE.fullmatch(first[1]) and len(first[1]) < 16:
-        promised, first = int(first[1]), next(rows, None)
-    if first is None:
+    if begin and _WHOLE.fullmatch(begin[0][1].strip()) and len(begin[0][1]) < 16:
+        promised = int(begin.pop(0)[1])
+    if not begin:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
-    line, row = first
-    separator = _separator(row)
-    header = [c.strip().lower() for c in _cells(row, separator)]
-    columns, width = [0, 1, 2], len(header)
-    pending: list[tuple[int, str]] = []
-    headed = _number(header[0], separator) is None
+    separator = separator_of([row for _, row in begin])
+    above = begin[0][1]
+    header = [c.lower() for c in cells_of(above, separator_of([above]))]
+    columns = [0, 1, 2]
+    headed = _number(header[0]) is None
     if headed:
+        del begin[0]
         if {"x", "y", "z"} <= set(header):
             columns = [header.index(c) for c in "xyz"]
         if any(header.count(c) > 1 for c in "xyz"):
             raise CloudError(f"The header of {path.name} names x, y or z twice; keep one.")
-        below = next(rows, None)
-        if below is None:
+        if not begin:
             raise CloudError(f"The cloud {path.name} is empty; scan again.")
-        pending.append(below)
-        if _separator(below[1]) != separator:  # a header of its own kind, such as "x y z" over "1,2,3"
-            separator = _separator(below[1])
-            width = len(_cells(below[1], separator))
-    else:
-        pending.append(first)
+    # a header of its own kind, such as "x y z" over "1,2,3", names no number of cells
+    own = headed and separator_of([above]) != separator
+    width = len(cells_of(begin[0][1], separator)) if own else len(header)
     if width < 3:
         raise CloudError(f"The file {path.name} has a row of fewer than three numbers; x, y and z are needed.")
     blocks: list[Array] = []
     block: list[list[float]] = []
     # a header that names as many columns as a row has cells says that commas separate them
     whole = separator == "," and not (headed and len(header) == width)
-    for line, row in _chain(pending, rows):
-        cells = _cells(row, separator)
+    for line, row in chain(begin, rows):
+        cells = cells_of(row, separator)
         if len(cells) != width:
             raise CloudError(_surplus(path, line, len(cells), width))
         whole = whole and _could_be_decimals(cells)
-        numbers = [_number(cells[c], separator) for c in columns]
+        numbers = [_number(cells[c]) for c in columns]
         if None in numbers:
             bad = next(cells[c] for c, v in zip(columns, numbers, strict=True) if v is None)
             raise CloudError(f"The file {path.name}, line {line}: '{bad[:40]}' is not a number.")
@@ -247,41 +237,7 @@ def _text(path: Path) -> str:
         return decoded(path, stream.read())
 
 
-def _rows(text: str) -> Iterator[tuple[int, str]]:
-    """Lines with a value, numbered from 1, without comments."""
-    number, at = 1, 0
-    for match in _LINE.finditer(text):
-        number += len(re.findall(r"\r\n|\r|\n", text[at : match.start()]))
-        at = match.start()
-        row = match.group().strip().rstrip(",;").strip()
-        if row and not row.startswith(("#", "//")):
-            yield number, row
-
-
-def _chain(first: list[tuple[int, str]], rest: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    yield from first
-    yield from rest
-
-
-def _separator(row: str) -> str:
-    """What separates the cells of a row; a blank for any number of blanks, tabs included."""
-    if ";" in row:
-        return ";"
-    if "\t" in row and len(row.split("\t")) > 2:
-        return "\t"
-    words = row.split()
-    if len(words) > 2 and not any(w.startswith(",") or w.endswith(",") for w in words):
-        return " "
-    return "," if "," in row else " "
-
-
-def _cells(row: str, separator: str) -> list[str]:
-    return row.split() if separator == " " else [cell.strip() for cell in row.split(separator)]
-
-
-def _number(cell: str, separator: str) -> float | None:
-    if "," in cell and separator != "," and _COMMA_DECIMAL.fullmatch(cell):
-        cell = cell.replace(",", ".")
+def _number(cell: str) -> float | None:
     if len(cell) > _LONGEST_NUMBER or "_" in cell:
         return None
     try:
@@ -319,11 +275,20 @@ def _read_pcd(path: Path, form: CloudForm) -> Array:
     return read_pcd(path, form)
 
 
+_TEXT = (".csv", ".txt", ".xyz", ".pts", ".asc")
 _READERS: dict[str, Callable[[Path, CloudForm], Array]] = {
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
     ".npz": _read_npz,
     ".npy": _read_npy,
-    **dict.fromkeys((".ply", ".ply.gz"), _read_ply),
-    **dict.fromkeys((".pcd", ".pcd.gz"), _read_pcd),
+    **dict.fromkeys(_TEXT, read_text_cloud),
+    ".ply.gz": _read_ply,
+    ".pcd.gz": _read_pcd,
+    **dict.fromkeys((f"{s}.gz" for s in _TEXT), read_text_cloud),
     **dict.fromkeys(IMAGES, read_depth_image),
-    **dict.fromkeys((*_TEXT, *(f"{s}.gz" for s in _TEXT)), lambda path, form: read_text_cloud(path)),
 }
+"""The forms of clouds: a new one is a row here and its function. The first is taken where a folder holds several."""
+SUFFIXES = tuple(_READERS)
+_NOTES = (".csv", ".txt", ".csv.gz", ".txt.gz", *IMAGES)
+# such a file beside the clouds is a cloud, not somebody's notes or pictures
+NO_NOTES = tuple(s for s in SUFFIXES if s not in _NOTES)

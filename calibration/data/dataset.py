@@ -230,7 +230,7 @@ def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
             f"dataset.yaml names the poses '{name[:60]}', and '{folder.name}' has no such file or folder."
         )
     if path.is_dir():
-        return files_of_poses(path) or None
+        return tuple(files_of_poses(path)) or None
     return None if path.suffix.lower() in RECORDINGS else path
 
 

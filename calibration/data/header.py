@@ -5,6 +5,8 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from pydrake.math import RigidTransform
+
 
 @dataclass
 class Units:
@@ -110,6 +112,11 @@ class DatasetHeader:
     scanner_link: str = ""
     second_robot: SecondRobot | None = None
     arm_error_mm: float = 0.4
+
+
+def placed(X: RigidTransform) -> dict[str, list[float]]:
+    """Return a pose as a header has it: xyz (m) and wxyz."""
+    return {"xyz": X.translation().tolist(), "wxyz": X.rotation().ToQuaternion().wxyz().tolist()}
 
 
 def without_cloud_form(header: DatasetHeader) -> dict[str, Any]:

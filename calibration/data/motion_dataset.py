@@ -25,7 +25,8 @@ from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, endi
 from weldcal.calibration.data.header import DatasetHeader, Units, without_cloud_form
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
-from weldcal.models.arms.chain import chain_poses, is_urdf
+from weldcal.models.arms.chain import is_urdf
+from weldcal.models.arms.kinematics import chain_poses
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, require_whole, sha256, whole_result, write_atomic

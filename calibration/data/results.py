@@ -29,7 +29,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole, write_atomic
 
 ON_BASE = "eye_on_base"
-RESULT_FILE = "calibration.yaml"
+RESULT_FILE, KINEMATICS_FILE = "calibration.yaml", "kinematics.yaml"
 
 
 @dataclass(frozen=True, kw_only=True)

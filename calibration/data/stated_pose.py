@@ -13,9 +13,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from weldcal.calibration.data.poses.formats import format_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import ARRAYS, MOUNTINGS, TREES, last_key, mounting_name
+from weldcal.calibration.data.poses.names import MOUNTINGS, TEXT, TREES, last_key, mounting_name
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
@@ -153,7 +154,7 @@ def _chosen(lists: list[Listing], name: str, pose: str | None) -> Listing:
 
 def _contents(path: Path) -> tuple[list[Listing], _Own]:
     ending = path.suffix.lower()
-    if ending in ARRAYS:
+    if format_of(path).endings not in (TEXT, TREES):
         return read_lists(path), _Own()
     if ending in TREES and ending != ".xml":
         return _of_tree(read_tree(path), path.name)

@@ -8,9 +8,9 @@ import numpy as np
 from weldcal.calibration.doctor.case import ArmDerivatives, DoctorCase
 from weldcal.calibration.doctor.fit import CauseFit, fit
 from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, fit_with_offset, log_rotation, skew
-from weldcal.models.arms.chain import Chain, chain_inverse, chain_poses, load_chain
-from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
+from weldcal.models.arms.kinematics import LINKS, Chain, chain_poses, known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -302,23 +302,16 @@ def another_arm(case: DoctorCase, null: CauseFit, arm: Chain) -> Explained | Non
 def joint_angles(case: DoctorCase, arm: Chain) -> Iterator[Array]:
     """Joint angles (n, joints) for all poses, on each branch of the arm that reaches them all."""
     poses = [as_transform(X) for X in case.X_BF]
-    if arm.name in known_arms():
-        model = load_arm(arm.name)
-        answers = [inverse_kinematics(model, X) for X in poses]
-        if any(len(a) == 0 for a in answers):
-            return
-        for seed in answers[0]:
-            yield np.array([a[np.argmin(np.abs(np.angle(np.exp(1j * (a - seed)))).sum(axis=1))] for a in answers])
+    answers = [inverse_kinematics(arm, X) for X in poses[: 1 if arm.n > len(LINKS) else None]]
+    if any(len(a) == 0 for a in answers):
         return
-    near: Array | None = None
-    found = []
-    for X in poses:
-        q = chain_inverse(arm, X, near)
-        if q is None:
-            return
-        near = q
-        found.append(q)
-    yield np.array(found)
+    if len(answers) < len(poses):  # more than six joints: whole families, of which this follows one
+        found = [nearest_solution(arm, X, answers[0][0]) for X in poses]
+        if all(q is not None for q in found):
+            yield np.array(found)
+        return
+    for seed in answers[0]:
+        yield np.array([a[np.argmin(np.abs(np.angle(np.exp(1j * (a - seed)))).sum(axis=1))] for a in answers])
 
 
 def _arm_columns(case: DoctorCase, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:

@@ -20,10 +20,10 @@ from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit
 from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.geometry.se3 import angle_of, as_transform, exp_rotation, frames_along, pose
-from weldcal.models.arms.chain import Chain, chain_capsules, known_chains, load_chain
+from weldcal.models.arms.chain import known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
-from weldcal.models.arms.urdf import link_capsules
+from weldcal.models.arms.kinematics import ArmModel, Chain, chain_poses, link_frames
+from weldcal.models.arms.shape import arm_capsules
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
@@ -211,7 +211,7 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
         return {}
     if q is None:
         return {}
-    reached = [(joint_frames(arm.stack, one)[-1] @ arm.X_LF)[:3, 3] for one in q]
+    reached = chain_poses(arm, q)[:, :3, 3]
     off = max(float(np.linalg.norm(p - data.poses[id].translation())) for p, id in zip(reached, ids, strict=True))
     return dict(zip(ids, q, strict=True)) if off < _JOINTS_M else {}
 
@@ -219,26 +219,22 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
 def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
     """Follow the joint angles of the scans on each branch of the inverse kinematics of a Universal Robots arm."""
     poses = [data.poses[id] for id in ids]
-    if arm.name not in known_arms() or not ids:
+    if not isinstance(arm, ArmModel) or not ids:
         return []
-    model, out = load_arm(arm.name), []
-    for first in inverse_kinematics(model, poses[0]):
+    out = []
+    for first in inverse_kinematics(arm, poses[0]):
         row: list[Array | None] = [first]
         for X in poses[1:]:
-            row.append(None if row[-1] is None else nearest_solution(model, X, row[-1]))
+            row.append(None if row[-1] is None else nearest_solution(arm, X, row[-1]))
         out.append([q for q in row if q is not None])
     return [row for row in out if len(row) == len(ids)]
 
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
     """Return the capsules of an arm at joint angles (n,) rad."""
-    frames = [np.eye(4), *joint_frames(arm.stack, q)]
-    if arm.name in known_arms():
-        rows = [(c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(load_arm(arm.name))]
-    else:
-        rows = [(int(k), np.array(v[:3]), np.array(v[3:6]), v[6]) for k, *v in chain_capsules(arm.name)]
-    ends = [[frames[k][:3, :3] @ p + frames[k][:3, 3] for p in (a, b)] for k, a, b, _ in rows]
-    return ArmShape(np.array(ends), np.array([r for *_, r in rows]))
+    frames, bodies = link_frames(arm, q), arm_capsules(arm)
+    ends = [[frames[c.link_index] @ p for p in (c.p_start, c.p_end)] for c in bodies]
+    return ArmShape(np.array(ends), np.array([c.radius for c in bodies]))
 
 
 def capsule_distance(points: Array, shape: ArmShape) -> tuple[Array, Array]:

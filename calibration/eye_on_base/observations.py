@@ -17,7 +17,7 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.poses.bag import find_bag
-from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, pick
+from weldcal.calibration.data.poses.readings import CHANGES, PoseReading, change_of, pick
 from weldcal.calibration.data.poses.source import find_poses
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
@@ -334,6 +334,12 @@ def choose_reading(
             f" ({_residual(best)}), or {other.reading.words} ({_residual(other)}). State the right one in dataset.yaml:"
             f" {_statement(best.reading.form)}, or {_statement(other.reading.form)}."
         )
+    by = change_of(best.reading, readings)
+    if by is not None and not best.reading.form.endswith(by):
+        raise InconsistentPoses(
+            f"The poses are stated as {by}, and the scans agree with them only if they are not ({_residual(best)})."
+            f" State {_statement(best.reading.form)} in dataset.yaml."
+        )
     dead = [one for one in tried if one is not best and one not in alive]
     text = f"Poses read as {best.reading.words}: {_residual(best)}"
     text += f"; the next best reading leaves {_residual(min(dead, key=_cost))}." if dead else "."
@@ -342,7 +348,8 @@ def choose_reading(
 
 def _statement(form: str) -> str:
     words = form.split(",")
-    parts = [f"rotation: {words[0]}"]
+    rotation = ",".join([words[0], *(w for w in words[1:] if w in ("transposed", "left_handed"))])
+    parts = [f"rotation: '{rotation}'" if "," in rotation else f"rotation: {rotation}"]
     parts += [f"angles: {w}" for w in words[1:] if w in ("deg", "rad")]
     parts += ["frame: base_in_flange" for w in words[1:] if w == "inverse"]
     return f"'poses: {{{', '.join(parts)}}}'"

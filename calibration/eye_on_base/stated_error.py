@@ -1,5 +1,7 @@
 """The error that a calibration states: the limit of the median error of new scans, and the budget of its sources."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +11,14 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.results import CalibrationResult, pose_records
+from weldcal.calibration.data.results import (
+    KINEMATICS_FILE,
+    CalibrationResult,
+    pose_records,
+    software_version,
+    statistics,
+    tilt_summary,
+)
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
@@ -96,15 +105,18 @@ def estimate_result(
     refused: Iterable[tuple[str, str]],
     X_FR: RigidTransform | None,
     joints: Sequence[Array],
+    *,
+    kinematics: str = "",
     **more: Any,
 ) -> CalibrationResult:
-    """Return an estimate as a result folder holds it.
+    """Return an estimate as a result folder holds it, recorded or live.
 
     Args:
         observations: as measured (n).
-        refused: id and reason of each scan that is not used, outliers included.
+        refused: id and reason of each scan that cannot be used; the outliers' reasons are added.
         X_FR: the feature in the flange; None for poses of the feature.
         joints: joint angles of the inliers, rad, where they are known.
+        kinematics: text of the refined kinematics' file.
         more: other fields of the result.
     """
     inliers = [o for o, keep in zip(observations, e.inliers, strict=True) if keep]
@@ -117,14 +129,29 @@ def estimate_result(
     fields: dict[str, Any] = {
         "X_BC": e.X_BC,
         "covariance": e.covariance,
-        "poses": pose_records([o.id for o in observations], e.inliers, values, refused),
+        "held_out_mm": statistics(1e3 * e.held_out.position_m[e.inliers]),
+        "tilt_deg": tilt_summary(e.held_out.tilt_rad[e.inliers]),
+        "poses": pose_records(
+            [o.id for o in observations], e.inliers, values, [*disagreeing(e, observations).items(), *refused]
+        ),
+        "warnings": e.warnings,
         "unobservable": e.unobservable,
         "sigma_position_mm": 1e3 * e.sigma_position_m,
+        "sigma_normal_deg": float(np.degrees(e.sigma_normal_rad)),
+        "software": software_version(),
+        "kinematics_file": KINEMATICS_FILE if kinematics else "",
         "joint_covariance": e.joint,
         "orientations": orientations_of(inliers, X_FR),
         "observed": observed_document(inliers, X_FR, joints),
     }
     return CalibrationResult(**fields | more)
+
+
+def disagreeing(e: CalibrationEstimate, observations: Sequence[Observation]) -> dict[str, str]:
+    """Return the reason why each outlier is not used, by its id."""
+    off = zip(observations, e.inliers, 1e3 * e.position_residuals_m, strict=True)
+    why = "Its centre disagrees by {:.1f} mm with the other poses; it is not used."
+    return {o.id: why.format(mm) for o, keep, mm in off if not keep}
 
 
 def observed_document(

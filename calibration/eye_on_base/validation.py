@@ -25,6 +25,15 @@ Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 """Camera pose and scanner correction from observations."""
 
 
+@dataclass(frozen=True)
+class VerificationResult:
+    """Errors of a calibration at one held-out pose."""
+
+    label: str
+    error_m: float
+    tilt_rad: float
+
+
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
     """Distances (n,) m between the flange centres by the calibration and by the robot."""
     p_C, p_B = (np.array([getattr(o, name) for o in observations]).reshape(-1, 3) for name in ("p_CR", "p_BR"))

@@ -1,6 +1,7 @@
 """Rigid motions on arrays: rotations, small changes, means, and the registration of two point sets in closed form."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.kinematics import Chain, chain_poses
 from weldcal.models.arrays import Array
 
 IDENTITY: Array = np.eye(4)
@@ -176,11 +177,7 @@ def flange_poses(arm: Chain, q: Array, errors: Array) -> Array:
 
     Translation] of each joint in its own frame before it turns: the third is the joint's offset.
     """
-    X = np.broadcast_to(IDENTITY, (len(q), 4, 4))
-    for i in range(arm.n):
-        turn = exp_rotation(q[:, i : i + 1] * [0.0, 0.0, 1.0])
-        X = X @ (arm.stack[i] @ pose(exp_rotation(errors[i, :3]), errors[i, 3:])) @ pose(turn, np.zeros(3))
-    return np.asarray(X @ arm.X_LF)
+    return chain_poses(replace(arm, stack=arm.stack @ pose(exp_rotation(errors[:, :3]), errors[:, 3:])), q)
 
 
 def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidTransform:

@@ -32,7 +32,7 @@ from weldcal.calibration.hand_eye.solve import (
     solve_ax_yb,
     solve_problem,
 )
-from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 

@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.poses.listing import Listing
+from weldcal.calibration.data.poses.source import unit_by_size
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.geometry.robust import MAD
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose, scaled
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
@@ -51,7 +52,6 @@ _BLOCK_S = 1.0  # within which errors of the streams may be correlated
 _SOFT = 2.0  # residuals, in sigmas, from which on they count less
 _MARGIN_S = 0.1  # by which the refined offset may differ from the first
 _SHORTEST_S, _SLOWEST_S = 3.0, 0.25  # a trajectory: its length, and the step between its poses
-_MILLIMETRES_FROM = 10.0  # a median distance above it is in millimetres
 _MOST_READINGS = 4
 _FAR_BETTER = 3.0  # ratio of residuals beyond which the better reading of two trajectories is the right one
 _LEAST_TURN = 0.02  # rad/s (rms): slower motion shows no offset by its speed
@@ -162,14 +162,16 @@ def synchronise_lists(
             f"The rotations of '{(robot if who == 'robot' else camera).name}' fit {max(len(a), len(b))}"
             f" conventions. Name the right one, for example --as {who}-form={(a if who == 'robot' else b)[0].form}."
         )
+    words = [one.unit or unit_by_size(one.numbers[0].p) for one in (robot, camera)]
+    units = [UNITS[unit] for unit in words]
     tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None
     for one, other in itertools.product(a, b):
         for inverted in (False, True):
-            eye = _metres(other.X, camera.unit)
+            eye = scaled(other.X, units[1])
             streams = PoseStreams(
                 _good(robot.times, robot),
-                _metres(one.X, robot.unit)[robot.good],
+                scaled(one.X, units[0])[robot.good],
                 _good(camera.times, camera),
                 (eye if inverted else inverse(eye))[camera.good],
             )
@@ -192,15 +194,8 @@ def synchronise_lists(
         )
     _, found, form, other_form = tried[0]
     reading = {
-        who: {
-            "file": one.name,
-            "form": one.form,
-            "unit": _unit(one),
-            "reading": written,
-            "rows": len(one),
-            "left_out": [],
-        }
-        for who, one, written in (("robot", robot, form), ("camera", camera, other_form))
+        who: {"file": one.name, "form": one.form, "unit": unit, "reading": written, "rows": len(one), "left_out": []}
+        for who, one, unit, written in (("robot", robot, words[0], form), ("camera", camera, words[1], other_form))
     }
     return replace(found, pairs=replace(found.pairs, reading=reading))
 
@@ -208,18 +203,6 @@ def synchronise_lists(
 def _good(times: Array | None, listing: Listing) -> Array:
     assert times is not None
     return np.asarray(times[listing.good])
-
-
-def _unit(listing: Listing) -> str:
-    far = float(np.median(np.linalg.norm(listing.numbers[0].p, axis=1)))
-    return listing.unit or ("mm" if far > _MILLIMETRES_FROM else "m")
-
-
-def _metres(X: Array, unit: str) -> Array:
-    out = X.copy()
-    far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
-    out[:, :3, 3] *= UNITS[unit or ("mm" if far > _MILLIMETRES_FROM else "m")]
-    return out
 
 
 def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> ClockOffset:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.models.arms.chain import Chain, chain_poses
+from weldcal.models.arms.kinematics import Chain, chain_poses
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_chain

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -18,12 +18,14 @@ from weldcal.calibration.planning.clearance import (
     occludes,
     self_distance,
 )
-from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution, why_unreached
+from weldcal.models.arms.kinematics import Chain, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
+
+_STARTS = 150  # views tried for a start posture: a choice, about 1 s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +62,7 @@ class PlannerConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPose:
-    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR.
+    """One pose to visit: flange X_BF, joints q (n,) rad, feature X_BR.
 
     ``gain`` in log determinant of the information of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a
     scanned point at the work point once this pose is in.
@@ -73,8 +75,32 @@ class PlannedPose:
     sigma_m: float
 
 
+@dataclass(frozen=True)
+class NextBest:
+    """A pose to add: joints (6,) rad, X_BF of the (first) arm, and ``what`` it reduces, m, without and with it."""
+
+    q: Array
+    X_BF: RigidTransform
+    before_m: float
+    after_m: float
+    q_2: Array | None = None
+    what: str = "sigma of a scanned point"
+
+    def sentence(self) -> str:
+        """Return the proposal as one sentence for the operator."""
+        joints, second = (
+            ", ".join(f"{v:.0f}" for v in np.degrees(q)) for q in (self.q, () if self.q_2 is None else self.q_2)
+        )
+        p = 1e3 * self.X_BF.translation()
+        return (
+            f"joints [{joints}] deg{f', second arm [{second}] deg' if second else ''} (flange at {p[0]:.0f},"
+            f" {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the {self.what} from"
+            f" {1e3 * self.before_m:.4f} to {1e3 * self.after_m:.4f} mm."
+        )
+
+
 def plan_calibration_poses(
-    arm: ArmModel,
+    arm: Chain,
     X_FR: RigidTransform,
     X_BC_guess: RigidTransform,
     scanner: ScannerPreset,
@@ -119,18 +145,18 @@ def predicted_sigma(
 
 
 def _candidates(
-    arm: ArmModel,
+    arm: Chain,
     X_FR: RigidTransform,
     X_BC: RigidTransform,
     scanner: ScannerPreset,
-    q_start: Array,
+    q_start: Array | None,
     config: PlannerConfig,
     tool: Sequence[Capsule],
 ) -> tuple[list[PlannedPose], Counter[str]]:
+    """Return what can be scanned near ``q_start``, or with any joint angles, and how often what forbids a view."""
     rng = np.random.default_rng(config.seed)
     bodies = arm_bodies(arm, tool)
     X_RF = X_FR.inverse()
-    reach = float(np.abs(arm.stack[:, :3, 3]).sum())
     pool: list[PlannedPose] = []
     why: Counter[str] = Counter()
     angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
@@ -146,18 +172,44 @@ def _candidates(
             continue
         X_BR = X_BC @ X_CR
         X_BF = X_BR @ X_RF
-        q, reason = None, "the scanner's working range is out of the arm's reach"
+        found, reason = [], "the scanner's working range is out of the arm's reach"
         if float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m:
             reason = "the table is in the way"
-        elif float(np.linalg.norm(X_BF.translation())) <= reach:
-            q = nearest_solution(arm, X_BF, q_start)
-        if q is not None:
-            reason = why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, q_start, config)
-        if q is None or reason:
+        elif q_start is None:
+            found = [*inverse_kinematics(arm, X_BF)]
+            reason = "" if found else why_unreached(arm, X_BF)
+        elif (q := nearest_solution(arm, X_BF, q_start)) is not None:
+            found = [q]
+        if not found:
             why[reason] += 1
-        else:
-            pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
+        for q in found:
+            start = q if q_start is None else q_start
+            if reason := why_not(arm, q, X_BC, (X_BR @ ring_R.T).T, bodies, start, config):
+                why[reason] += 1
+            else:
+                pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
     return pool, why
+
+
+def start_posture(
+    arm: Chain,
+    X_FR: RigidTransform,
+    X_BC: RigidTransform,
+    scanner: ScannerPreset,
+    config: PlannerConfig,
+    tool: Sequence[Capsule] = (),
+) -> Array:
+    """Choose clear joint angles (n,) rad that hold the feature to the scanner, from which most such others are near.
+
+    Raises:
+        UnreachableScanner: no such joint angles; the message names the commonest obstacle.
+    """
+    pool, why = _candidates(arm, X_FR, X_BC, scanner, None, replace(config, max_trials=_STARTS), tool)
+    if not pool:
+        raise UnreachableScanner(_explain(why, 0, 1))
+    q = np.array([c.q for c in pool])
+    near = np.abs(q[:, None] - q).max(axis=2) <= config.max_travel_rad
+    return np.asarray(q[int(np.argmax(near.sum(axis=1)))])
 
 
 def random_view(
@@ -190,7 +242,7 @@ def random_view(
 
 
 def why_not(
-    arm: ArmModel,
+    arm: Chain,
     q: Array,
     X_BC: RigidTransform,
     points_B: Array,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.models.arms.kinematics import ArmModel, link_frames
-from weldcal.models.arms.urdf import Capsule, link_capsules
+from weldcal.models.arms.kinematics import Chain, link_frames
+from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
 from weldcal.models.mesh import TriMesh
@@ -37,10 +37,12 @@ class LinkCapsule:
     radius: float
 
 
-def arm_bodies(arm: ArmModel, tool: Sequence[Capsule] = ()) -> list[LinkCapsule]:
+def arm_bodies(arm: Chain, tool: Sequence[Capsule] = ()) -> list[LinkCapsule]:
     """Capsules of the arm's links and of a tool given in the flange frame."""
-    bodies = [LinkCapsule(c.link_index, c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(arm)]
-    return bodies + [LinkCapsule(TOOL, 6, c.p_start, c.p_end, c.radius) for c in tool]
+    from weldcal.models.arms.shape import arm_capsules  # only here: a job that plans nothing needs no shapes
+
+    bodies = [LinkCapsule(c.link_index, c.link_index, c.p_start, c.p_end, c.radius) for c in arm_capsules(arm)]
+    return bodies + [LinkCapsule(arm.n + 1, arm.n, c.p_start, c.p_end, c.radius) for c in tool]
 
 
 def body_ends(body: LinkCapsule, frames: list[RigidTransform]) -> tuple[Array, Array]:
@@ -94,7 +96,7 @@ def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: 
 
 
 def path_clearance(
-    arm: ArmModel, bodies: list[LinkCapsule], q_a: Array, q_b: Array, step_rad: float = 0.1
+    arm: Chain, bodies: list[LinkCapsule], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
     """Return the lowest height (m) of the moving bodies and the smallest gap (m) on a path straight in joint space.
 
@@ -203,7 +205,7 @@ class Surroundings:
                 return obstacle.name
         return ""
 
-    def touched_on_path(self, arm: ArmModel, bodies: Sequence[LinkCapsule], q_a: Array, q_b: Array) -> str:
+    def touched_on_path(self, arm: Chain, bodies: Sequence[LinkCapsule], q_a: Array, q_b: Array) -> str:
         """As `touched`, on a path straight in joint space from q_a to q_b (6,) rad."""
         if not self.obstacles:
             return ""

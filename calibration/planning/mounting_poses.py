@@ -57,6 +57,11 @@ class MountingPose:
     X_CR: RigidTransform
     via_home: bool = False
 
+    @property
+    def joints(self) -> Array:
+        """The joints of one arm (6,) or both (12,), rad."""
+        return self.q if self.q_2 is None else np.concatenate([self.q, self.q_2])
+
 
 def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
     """Plan ``n`` poses, most informative first, then ``held_out`` drawn at random, then all others that would do.

@@ -11,9 +11,8 @@ from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, State, linearise
 from weldcal.calibration.hand_eye.solve import HandEyeResult
-from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
 
@@ -91,8 +90,7 @@ def _axes(scanner: ScannerPreset) -> tuple[tuple[float, float, float], tuple[flo
 _TURNS_RAD = np.radians([20.0, 40.0, 60.0])
 _PRIOR_SHARE = 10.0  # what is believed of an open direction: ten radians or extents
 _SAMPLES = 15
-_TRIED = 40  # candidates, best first, whose joint angles are sought; fewer where these are found step by step
-_TRIED_BY_STEPS = 12
+_TRIED = 40  # candidates, best first, whose joint angles are sought
 _ROOM = 0.1  # of their spread: how far from the places so far a pose may lie where no robot is named
 _MOST = 0.8  # of the poses so far that a robot must reach, to be the one that took them
 
@@ -236,7 +234,11 @@ def _reach(
         return lambda _: (True, None), "Reach not checked: this mounting leaves the arm's pose open.", 0
     why = "Reach not checked beyond staying near the poses so far: name the robot with --robot."
     if arm is not None:
-        solve, tries = _inverse_of(arm)
+
+        def solve(X: Array) -> Array | None:
+            found = inverse_kinematics(arm, as_transform(X))
+            return found[int(np.argmin(np.abs(found).max(axis=1)))] if len(found) else None
+
         some = taken[:: max(1, len(taken) // 8)]
         if float(np.mean([solve(X) is not None for X in some])) >= _MOST:
 
@@ -244,7 +246,7 @@ def _reach(
                 q = solve(robot[k])
                 return q is not None, q
 
-            return reached, f"Within reach and limits of {arm.name}.", tries
+            return reached, f"Within reach and limits of {arm.name}.", _TRIED
         why = f"Reach not checked: {arm.name} does not reach the poses so far (another base or tool frame?)."
     p = taken[:, :3, 3]
     room = _ROOM * float(np.ptp(p, axis=0).max())
@@ -254,18 +256,6 @@ def _reach(
         return bool(((robot[k, :3, 3] >= low) & (robot[k, :3, 3] <= high)).all()), None
 
     return near, why, 0
-
-
-def _inverse_of(arm: Chain) -> tuple[Callable[[Array], Array | None], int]:
-    if arm.name in known_arms():
-        model = load_arm(arm.name)
-
-        def closed(X: Array) -> Array | None:
-            found = inverse_kinematics(model, as_transform(X))
-            return found[int(np.argmin(np.abs(found).max(axis=1)))] if len(found) else None
-
-        return closed, _TRIED
-    return lambda X: chain_inverse(arm, as_transform(X)), _TRIED_BY_STEPS
 
 
 def _seen_rotation(problem: Problem, state: State, i: int) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.dh import dh_frames
 from weldcal.models.errors import InputError
 
 # Joint 1 turns the base and joint 6 the flange: their offsets are part of other unknowns.
@@ -68,36 +68,9 @@ class DhArm:
             raise InputError(f"An arm's table has six finite rows [a, alpha, d, theta], not the shape {dh.shape}.")
         return DhArm(dh)
 
-    @staticmethod
-    def of(arm: ArmModel) -> DhArm:
-        """Return a UR arm's table, by the nominal lengths of its model."""
-        d, right = arm.dh, 0.5 * np.pi
-        return DhArm(
-            np.array(
-                [
-                    [0.0, right, d.d1, 0.0],
-                    [d.a2, 0.0, 0.0, 0.0],
-                    [d.a3, 0.0, 0.0, 0.0],
-                    [0.0, right, d.d4, 0.0],
-                    [0.0, -right, d.d5, 0.0],
-                    [0.0, 0.0, d.d6, 0.0],
-                ]
-            )
-        )
-
     def frames(self, q: Floats) -> Floats:
         """Homogeneous poses (n, 7, 4, 4) of the base and of the frames after each joint, for joints (n, 6) rad."""
-        out = np.empty((len(q), 7, 4, 4))
-        out[:, 0] = np.eye(4)
-        for k, (a, alpha, d, offset) in enumerate(self.rows):
-            c, s, ca, sa = np.cos(q[:, k] + offset), np.sin(q[:, k] + offset), np.cos(alpha), np.sin(alpha)
-            A = np.zeros((len(q), 4, 4))
-            A[:, 0] = np.column_stack([c, -s * ca, s * sa, a * c])
-            A[:, 1] = np.column_stack([s, c * ca, -c * sa, a * s])
-            A[:, 2] = [0.0, sa, ca, d]
-            A[:, 3, 3] = 1.0
-            out[:, k + 1] = out[:, k] @ A
-        return out
+        return dh_frames(self.rows, q)
 
     def loads(self, q: Floats) -> Floats:
         """Horizontal lever (n, 2) m of the flange about the axes of joints 2 and 3.

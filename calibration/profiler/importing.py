@@ -11,21 +11,31 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.bag import find_bag
+from weldcal.calibration.data.poses.formats import may_hold_poses
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
-from weldcal.calibration.data.poses.names import ENDINGS, natural, number_of
+from weldcal.calibration.data.poses.lists import folder_lists, pose_a_file, read_lists, together
+from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
-from weldcal.calibration.data.poses.source import robot_list
+from weldcal.calibration.data.poses.source import robot_list, unit_by_size
 from weldcal.calibration.data.poses.trees import stacked
-from weldcal.calibration.profiler.exports import TABLES, TREES, UNITS, Profiles, joined, listed_columns, read_profiles
+from weldcal.calibration.geometry.se3 import scaled
+from weldcal.calibration.profiler.exports import (
+    SECONDS,
+    TABLES,
+    TREES,
+    UNITS,
+    Profiles,
+    joined,
+    listed_columns,
+    read_profiles,
+)
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 
 _POSE_NAME = re.compile(r"(?i)(^|[^a-z])(pos|rob)\d*($|[^a-z])|pose|robot|flange|tcp|tool")
-_POSE_ENDINGS = (*ENDINGS, ".rob")
-_MILLIMETRES = 10.0  # a median distance of the flange above it is in millimetres
 _WIDE = 1.0  # a laser line of more than this is in millimetres
 _MOST_FILES = 20_000
 _OPTION = "--as robot-form"
@@ -78,12 +88,25 @@ def import_profiles(
     listing = _poses(path, found, beside, poses)
     if form:
         listing = listing.stated(PoseForm(rotation=form), _OPTION)
-    rows, kept = _paired(listing, found)
+    same = {number_of(i) for i in listing.ids} == {number_of(i) for i in found.ids}
+    seconds = found.times * SECONDS[found.time_unit] if found.times is not None and found.time_unit else None
+    ids = found.ids if same or len(found) != len(listing) else ()
+    shown = Listing(name=found.source, numbers=(), ids=ids, times=seconds, joints=np.zeros((len(found), 0)))
+    rows, kept, _ = together(listing, shown)
+    alone = [
+        f"{one.ids[k] if one.ids else f'row {k + 1}'} of {one.name}: It has no partner."
+        for one, used in ((listing, rows), (shown, kept))
+        for k in range(len(one))
+        if k not in set(used.tolist())
+    ]
     good = listing.good[rows]
     rows, kept = rows[good], kept[good]
     if not len(rows):
-        raise InputError(f"'{listing.name}' holds no pose for any of the {len(found)} profiles of '{found.source}'.")
-    readings, words = _metric_poses(listing, rows, unit)
+        why = f": {listing.left_out[0][1]}" if listing.left_out else "."
+        raise InputError(
+            f"'{listing.name}' holds no pose for any of the {len(found)} profiles of '{found.source}'{why}"
+        )
+    readings, words = _metric_poses(listing, rows, unit, alone)
     length = profile_unit(found, unit)
     profiles = tuple(UNITS[length] * found.points[k] for k in kept)
     reading: dict[str, dict[str, object]] = {
@@ -122,7 +145,9 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
         p
         for place in (path, *sorted(q for q in path.iterdir() if q.is_dir() and not q.name.startswith((".", "_"))))
         for p in sorted(place.iterdir(), key=lambda q: natural(q.name))
-        if p.is_file() and p.suffix.lower() in (*TABLES, *TREES, *_POSE_ENDINGS) and not p.name.startswith((".", "_"))
+        if p.is_file()
+        and (p.suffix.lower() in (*TABLES, *TREES) or may_hold_poses(p))
+        and not p.name.startswith((".", "_"))
     ]
     if len(files) > _MOST_FILES:
         raise InputError(f"'{path.name}' holds {len(files)} files, more than {_MOST_FILES}, the most that are read.")
@@ -181,7 +206,7 @@ def _beside(path: Path) -> list[Path]:
             for p in path.parent.iterdir()
             if p != path
             and p.is_file()
-            and p.suffix.lower() in _POSE_ENDINGS
+            and may_hold_poses(p)
             and _POSE_NAME.search(p.stem)
             and not p.name.startswith(".")
         ]
@@ -194,12 +219,9 @@ def _beside(path: Path) -> list[Path]:
 def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | None) -> Listing:
     """Return the list of the flange's poses: the stated file's, the table's own, or that of the files beside."""
     if stated is not None:
-        files = (
-            sorted((p for p in stated.iterdir() if p.is_file()), key=lambda p: natural(p.name))
-            if stated.is_dir()
-            else [stated]
-        )
-        return _listing(files, stated.name)
+        bag = find_bag(stated) if stated.exists() else None
+        lists = folder_lists(stated, 1) if bag is None and stated.is_dir() else read_lists(bag or stated)
+        return robot_list(lists, stated.name, PoseForm())
     if found.poses is not None:
         return found.poses
     single = [p for p in beside if number_of(p.stem) is None] or list(beside)
@@ -242,67 +264,29 @@ def _no_poses(found: Profiles) -> str:
 
 def _listing(files: Sequence[Path], name: str) -> Listing:
     if len(files) == 1:
-        return robot_list(_lists(read_lists(files[0]), files[0]), files[0].name, PoseForm())
-    lists = [_lists(lists_of_file(p), p) for p in files]
-    many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
-    if many is not None:
-        raise InputError(
-            f"'{many.name}' does not hold one pose, as the {len(files) - 1} files beside it do; give one pose a file."
-        )
-    return stacked(
-        [found[0] for found in lists], f"{name}, {files[0].name} ... {files[-1].name}", tuple(p.stem for p in files)
-    )
-
-
-def _lists(lists: list[Listing], path: Path) -> list[Listing]:
-    if not lists:
-        raise InputError(
-            f"'{path.name}' holds no poses. Give a row for each profile, such as x_mm,y_mm,z_mm,qw,qx,qy,qz."
-        )
-    return lists
-
-
-def _paired(listing: Listing, found: Profiles) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the poses and profiles that belong together: by the numbers in their names, else in order."""
-    numbers = [[number_of(i) for i in ids] for ids in (listing.ids, found.ids)]
-    known = all(n and None not in n and len(set(n)) == len(n) for n in numbers)
-    if len(listing) == len(found) and not (known and set(numbers[0]) == set(numbers[1])):
-        return np.arange(len(found)), np.arange(len(found))
-    if known:
-        common = sorted(set(numbers[0]) & set(numbers[1]))  # type: ignore[type-var]
-        if common and len(common) == min(len(listing), len(found)):
-            return np.array([numbers[0].index(k) for k in common]), np.array([numbers[1].index(k) for k in common])
-    raise InputError(
-        f"'{listing.name}' holds {len(listing)} poses and '{found.source}' {len(found)} profiles; without numbers in a"
-        " column id they pair in order, one for one: remove what has no partner, or number both alike."
-    )
+        return robot_list(read_lists(files[0]), files[0].name, PoseForm())
+    return pose_a_file(files, f"{name}, {files[0].name} ... {files[-1].name}")
 
 
 def _metric_poses(
-    listing: Listing, rows: np.ndarray, unit: str | None
+    listing: Listing, rows: np.ndarray, unit: str | None, alone: Sequence[str] = ()
 ) -> tuple[tuple[PoseReading, ...], dict[str, object]]:
     """Return the different readings of the poses, in metres, and how the list was understood."""
     readings: list[PoseReading] = []
     for one in pick(listing.readings, rows):
         if not any(np.abs(one.X - other.X).max() < 1e-9 for other in readings):
             readings.append(one)
-    p = readings[0].X[:, :3, 3]
-    length = listing.unit or unit or ("mm" if float(np.median(np.linalg.norm(p, axis=1))) > _MILLIMETRES else "m")
-    scale = UNITS[length]
-    metric = []
-    for one in readings:
-        X = one.X.copy()
-        X[:, :3, 3] *= scale
-        metric.append(replace(one, X=X))
+    length = listing.unit or unit or unit_by_size(readings[0].X[:, :3, 3])
+    metric = tuple(replace(one, X=scaled(one.X, UNITS[length])) for one in readings)
     words: dict[str, object] = {
         "file": listing.name,
         "form": listing.form,
         "unit": length,
         "reading": readings[0].form,
         "rows": len(listing),
-        "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out],
+        "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out] + list(alone),
     }
-    return tuple(metric), words
+    return metric, words
 
 
 def profile_unit(found: Profiles, unit: str | None) -> str:

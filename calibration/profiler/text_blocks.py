@@ -1,6 +1,5 @@
 """Split text exports of profilers into blocks of numbers with their headers, and read those of LMI Gocator."""
 
-import csv
 import re
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,11 +9,10 @@ import numpy as np
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 from weldcal.models.files import MOST_CELLS
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _UNIT = re.compile(r"[\[(].{0,6}[\])]|mm|µm|um|m")
 _NOTHING = ("", "-", "--", "---", "invalid", "none", "null", "n/a", "na", "fffffff", "-fffffff")
-_SAMPLE = 200  # lines that decide the separator
 
 SECTIONS = ("RawProfile", "Profile", "Surface", "Part", "SurfaceSection")
 """Sections that hold profiles, in the order in which they are used."""
@@ -38,35 +36,6 @@ class NumberRows:
     line: int
 
 
-def separator_of(lines: list[str]) -> str:
-    """Return the mark between the cells of most lines: semicolon, tab, comma, or blanks."""
-    sample = [s for s in lines if re.search(r"\d", s)][:_SAMPLE]
-    if not sample:
-        return ","
-    for mark in (";", "\t"):
-        if sum(mark in s for s in sample) >= 0.5 * len(sample):
-            return mark
-    words = [w for s in sample for w in s.split() if "," in w]
-    if words and all(_DECIMAL_COMMA.fullmatch(w) for w in words) and any(len(s.split()) > 1 for s in sample):
-        return " "
-    return "," if any("," in s for s in sample) else " "
-
-
-def cells_of(line: str, separator: str) -> list[str]:
-    """Return the cells of a line, stripped, with decimal points."""
-    plain = re.sub(r"\s+([\[(])", r"\1", line).split() if separator == " " else line.split(separator)
-    if separator not in line and len(words := line.split()) > 1 and all(map(_is_number, words)):
-        plain = words  # blanks in one line of a table with another mark
-    cells = [c.strip().strip("\"'") for c in plain]
-    if separator != ",":
-        cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
-    return cells
-
-
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?", word) is not None
-
-
 def number_in(cell: str) -> float | None:
     """Return the number in a cell: NaN where it says that nothing was measured, None where it holds words."""
     try:
@@ -81,8 +50,8 @@ def blocks_of(text: str, name: str) -> list[NumberRows]:
     Raises:
         InputError: rows of a block have different lengths, or the file has more cells than are read.
     """
-    lines = re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))
-    separator = separator_of(lines)
+    lines = list(lines_of(text))
+    separator = separator_of([line for _, line in lines])
     found: list[NumberRows] = []
     header: tuple[str, ...] = ()
     caption = ""
@@ -105,12 +74,14 @@ def blocks_of(text: str, name: str) -> list[NumberRows]:
             found.append(NumberRows(header, caption, table, first))
             rows, caption = [], ""
 
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
+    before = 0
+    for number, line in lines:
+        if number > before + 1:
             close()
-            continue
+        before = number
         bare = line.lstrip("#%!/ \t") if line.lstrip().startswith(("#", "%", "!", "//")) else line
-        cells = cells_of(bare, separator)
+        glued = re.sub(r"\s+([\[(])", r"\1", bare) if separator == " " else bare
+        cells = [c.strip("\"'") for c in cells_of(glued, separator)]
         size = len(cells)
         while len(cells) > 1 and cells[-1] == "":
             cells.pop()
@@ -193,22 +164,19 @@ def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
     found: dict[str, list[list[str]]] = {}
     rows: list[list[str]] | None = None
     cells = 0
-    try:
-        for row in csv.reader(re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))):
-            row = [c.strip() for c in row]
-            if not any(row):
-                continue
-            if rows is None:
-                rows = found.setdefault(row[0], [])
-            elif row[0].lower() == "end" and not any(row[1:]):
-                rows = None
-            else:
-                rows.append(row)
-                cells += len(row)
-                if cells > MOST_CELLS:
-                    raise InputError(f"'{name}' has more than {MOST_CELLS} cells, the most that are read.")
-    except csv.Error as e:
-        raise InputError(f"'{name}' cannot be read as CSV ({e}).") from e
+    for _, line in lines_of(text):
+        row = cells_of(line, ",")
+        if not any(row):
+            continue
+        if rows is None:
+            rows = found.setdefault(row[0], [])
+        elif row[0].lower() == "end" and not any(row[1:]):
+            rows = None
+        else:
+            rows.append(row)
+            cells += len(row)
+            if cells > MOST_CELLS:
+                raise InputError(f"'{name}' has more than {MOST_CELLS} cells, the most that are read.")
     return found
 
 

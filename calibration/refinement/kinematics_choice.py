@@ -32,8 +32,8 @@ from weldcal.calibration.refinement.kinematics_fit import (
     unsought,
 )
 from weldcal.calibration.refinement.local_field import GAIN
-from weldcal.models.arms.chain import Chain, load_chain
-from weldcal.models.arms.kinematics import LINKS
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import LINKS, Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 

@@ -15,7 +15,7 @@ from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, flange_poses, inverse, pose, skew
-from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 
 KINDS = ("joints", "links")
@@ -133,9 +133,7 @@ class KinematicsFit:
     def corrected_stack(self) -> Array:
         """Return the arm's link transforms (n, 4, 4) with the errors found: m, rad."""
         errors = self.errors.errors(self.u)
-        return np.array(
-            [X @ pose(exp_rotation(e[:3]), e[3:]) for X, e in zip(self.errors.arm.stack, errors, strict=True)]
-        )
+        return np.asarray(self.errors.arm.stack @ pose(exp_rotation(errors[:, :3]), errors[:, 3:]))
 
     def applied(self, observations: Sequence[Observation], q: Array) -> list[Observation]:
         """Observations with corrected centres and normals and with the poses that the corrected arm reaches."""

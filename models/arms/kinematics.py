@@ -1,4 +1,4 @@
-"""Universal Robots' link transforms, limits and masses, with forward kinematics and Jacobians.
+"""An arm of revolute joints: its link transforms, forward kinematics and Jacobians, and Universal Robots' numbers.
 
 Frames: B robot base as the controller means it (ROS `base_link` turned by pi about z), L_i the six link frames, F the
 flange (DH frame 6, z out of the flange), which is the last link frame. A link transform is the pose of link i's joint
@@ -9,11 +9,11 @@ factory calibration has the same schema as the nominal numbers, so nothing else 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +39,7 @@ JOINT_NAMES = (
 
 # Factory calibrations move the flange by millimetres; a file that moves it by more is another arm's or in other units.
 MAX_CALIBRATION_SHIFT_M = 0.05
-_POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 _HERE = Path(__file__).resolve().parent
 
 
@@ -67,24 +67,42 @@ class Housings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArmModel:
-    """One arm. Arrays are read-only; joint order is `joint_names`, link order is `link_names` (link 0 is the base).
+class Chain:
+    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis.
 
-    ``stack`` is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are
-    (6,) in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
-    centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
-    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the
-    radii of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or
-    None for the nominal numbers. up (3,) is the unit vector against gravity in B: +z of an arm that stands.
+    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s. up (3,) is the unit vector against gravity
+    in B: +z of an arm that stands. ``file`` is the URDF that the arm is read from.
     """
 
     name: str
     joint_names: tuple[str, ...]
-    link_names: tuple[str, ...]
     stack: Array
+    X_LF: Array = field(default_factory=lambda: _frozen(np.eye(4)))
     position_lower: Array
     position_upper: Array
     velocity_limit: Array
+    up: Array = field(default_factory=lambda: _frozen([0.0, 0.0, 1.0]))
+    file: Path | None = None
+
+    @property
+    def n(self) -> int:
+        """How many joints."""
+        return len(self.stack)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ArmModel(Chain):
+    """One arm of Universal Robots, a chain with bodies and masses. Arrays are read-only; link order is `link_names`.
+
+    Link 0 is the base. Limits are (6,) in rad/s^2, Nm (the acceleration limits are a model choice, see
+    joint_limits.yaml). masses (6,) kg,
+    centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
+    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the
+    radii of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or
+    None for the nominal numbers.
+    """
+
+    link_names: tuple[str, ...]
     acceleration_limit: Array
     effort_limit: Array
     base_mass: float
@@ -97,12 +115,9 @@ class ArmModel:
     dh: DenavitHartenberg
     housings: Housings
     calibration: str | None = None
-    up: Array = field(default_factory=lambda: _frozen([0.0, 0.0, 1.0]))
 
-    @property
-    def transforms(self) -> tuple[RigidTransform, ...]:
-        """The six link transforms X_{i-1,i}(0)."""
-        return tuple(_rigid(X[:3, :3], X[:3, 3]) for X in self.stack)
+
+_Arm = TypeVar("_Arm", bound=Chain)
 
 
 def known_arms() -> tuple[str, ...]:
@@ -126,11 +141,8 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
     nominal = _nominal(name)
     if kinematics is None:
         return nominal
-    stack, calibration = _read_kinematics(Path(kinematics))
-    stack = _slide_to_nominal(stack, nominal.stack)
     advice = f"give the calibration of a {name}, in metres and radians"
-    _require_same_arm(stack, nominal.stack, name, Path(kinematics).name, advice)
-    return replace(nominal, stack=_frozen(stack), calibration=calibration)
+    return with_link_transforms(nominal, *_read_kinematics(Path(kinematics)), Path(kinematics).name, advice)
 
 
 @lru_cache(maxsize=8)
@@ -148,7 +160,7 @@ def _nominal(name: str) -> ArmModel:
     def limit(key: str) -> Array:
         return _frozen([_number(limits, joint, key) for joint in JOINT_NAMES])
 
-    rotations = [_rotation(*(_number(inertia, "rotation", link, k) for k in _POSE_KEYS[3:])) for link in LINKS]
+    rotations = [_rotation(*(_number(inertia, "rotation", link, k) for k in POSE_KEYS[3:])) for link in LINKS]
     tensors = [_tensor({k: _number(inertia, "tensor", link, k) for k in _TENSOR_KEYS}) for link in LINKS]
     return ArmModel(
         name=name,
@@ -174,43 +186,54 @@ def _nominal(name: str) -> ArmModel:
     )
 
 
-def mounted(arm: ArmModel, X_WB: RigidTransform) -> ArmModel:
+def mounted(arm: _Arm, X_WB: RigidTransform) -> _Arm:
     """Return the same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
     # exactly +z for an upright base: rounding must not change a plan
     up = X_WB.rotation().matrix()[2]
     return replace(arm, up=_frozen(np.where(np.abs(up - np.round(up)) < 1e-12, np.round(up), up)))
 
 
-def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:
+def with_link_transforms(
+    arm: ArmModel, stack: Array, calibration: str | None, source: str, advice: str = ""
+) -> ArmModel:
     """Return the same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
 
     As in `load_arm`, the link frames are slid along their own joint axes to where those of `arm` lie, which changes no
     flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these
-    are.
+    are, `advice` what to do.
 
     Raises:
         InputError: the transforms are another arm's.
     """
     stack = _slide_to_nominal(stack, arm.stack)
-    advice = f"connect a {arm.name}, or name this robot's arm in the scenario"
-    _require_same_arm(stack, arm.stack, arm.name, source, advice)
+    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
+    shift = (joint_frames(stack, postures) - joint_frames(arm.stack, postures))[:, 5, :3, 3]
+    if not (largest := float(np.linalg.norm(shift, axis=1).max())) <= MAX_CALIBRATION_SHIFT_M:
+        advice = advice or f"connect a {arm.name}, or name this robot's arm in the scenario"
+        raise InputError(f"{source} moves the flange by {largest * 1e3:.0f} mm from a nominal {arm.name}: {advice}.")
     return replace(arm, stack=_frozen(stack), calibration=calibration)
 
 
-def forward_kinematics(arm: ArmModel, q: ArrayLike) -> RigidTransform:
-    """Flange pose X_BF at joint angles q (6,) rad; at 500 Hz use `kinematics_and_jacobian`, which builds no object."""
-    X = joint_frames(arm.stack, np.asarray(q, dtype=np.float64))[5]
+def forward_kinematics(arm: Chain, q: ArrayLike) -> RigidTransform:
+    """Flange pose X_BF at joint angles q (n,) rad; at 500 Hz use `kinematics_and_jacobian`, which builds no object."""
+    X = chain_poses(arm, q)
     return _rigid(X[:3, :3], X[:3, 3])
 
 
-def link_frames(arm: ArmModel, q: ArrayLike) -> list[RigidTransform]:
-    """Poses in B of the seven links of `arm.link_names` at q (6,) rad: the base (identity) first, the flange F last."""
+def chain_poses(arm: Chain, q: ArrayLike) -> Array:
+    """Flange poses X_BF (..., 4, 4) at joint angles (..., n) rad."""
+    return np.asarray(joint_frames(arm.stack, np.asarray(q, dtype=np.float64))[..., -1, :, :] @ arm.X_LF)
+
+
+def link_frames(arm: Chain, q: ArrayLike) -> list[RigidTransform]:
+    """Poses in B of base (identity) and links at q (n,) rad, in order; the last link's frame is the flange F."""
     chain = joint_frames(arm.stack, np.asarray(q, dtype=np.float64))
+    chain[-1] = chain[-1] @ arm.X_LF
     return [_drake().RigidTransform(), *(_rigid(X[:3, :3], X[:3, 3]) for X in chain)]
 
 
-def jacobian(arm: ArmModel, q: ArrayLike, p_FP: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Geometric Jacobian (6, 6) of point P fixed in F: [omega_BF; v_BP] = J qdot, in axes of B."""
+def jacobian(arm: Chain, q: ArrayLike, p_FP: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Geometric Jacobian (6, n) of point P fixed in F: [omega_BF; v_BP] = J qdot, in axes of B."""
     return kinematics_and_jacobian(arm, np.asarray(q, dtype=np.float64), np.asarray(p_FP, dtype=np.float64))[2]
 
 
@@ -218,22 +241,22 @@ _ORIGIN = np.zeros(3)
 _ORIGIN.setflags(write=False)
 
 
-def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> tuple[Array, Array, Array]:
-    """R_BF (3, 3), p_BP (3,) m and the Jacobian J (6, 6) of P in B, from raw arrays, unchecked: the fast path.
+def kinematics_and_jacobian(arm: Chain, q: Array, p_FP: Array = _ORIGIN) -> tuple[Array, Array, Array]:
+    """R_BF (..., 3, 3), p_BP (..., 3) m and the Jacobian J (..., 6, n) of P in B at q (..., n) rad, unchecked.
 
     J is geometric: column i is [z_i; z_i x (p_P - o_i)] with z_i, o_i the axis and origin of joint i
     (Siciliano et al., Robotics, 2009, Eq. 3.30, with rotation first as Drake orders spatial vectors).
     """
     X = joint_frames(arm.stack, q)
-    R = X[5, :3, :3]
-    p = R @ p_FP + X[5, :3, 3]
-    z0, z1, z2 = z = X[:, :3, 2].T
-    r0, r1, r2 = p[:, None] - X[:, :3, 3].T
-    J = np.empty((6, 6))
-    J[:3] = z
-    J[3] = z1 * r2 - z2 * r1
-    J[4] = z2 * r0 - z0 * r2
-    J[5] = z0 * r1 - z1 * r0
+    X_BF = X[..., -1, :, :] @ arm.X_LF
+    R = X_BF[..., :3, :3]
+    p = R @ p_FP + X_BF[..., :3, 3]
+    z, r = X[..., :3, 2], p[..., None, :] - X[..., :3, 3]
+    J = np.empty((*q.shape[:-1], 6, q.shape[-1]))
+    J[..., :3, :] = np.swapaxes(z, -1, -2)
+    J[..., 3, :] = z[..., 1] * r[..., 2] - z[..., 2] * r[..., 1]
+    J[..., 4, :] = z[..., 2] * r[..., 0] - z[..., 0] * r[..., 2]
+    J[..., 5, :] = z[..., 0] * r[..., 1] - z[..., 1] * r[..., 0]
     return R, p, J
 
 
@@ -249,14 +272,15 @@ def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
 
 
 def joint_frames(stack: Array, q: Array) -> Array:
-    """Poses (n, 4, 4) in B of the joints of a chain, turned by q (n,) rad: ``stack`` is each in its parent at zero."""
-    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
+    """Poses (..., n, 4, 4) in B of a chain's joints, turned by q (..., n) rad: ``stack`` is each in its parent."""
+    c, s = np.cos(q)[..., None], np.sin(q)[..., None]
     x, y = stack[:, :, 0], stack[:, :, 1]
-    step = stack.copy()
-    step[:, :, 0] = x * c + y * s
-    step[:, :, 1] = y * c - x * s
-    for i in range(1, len(step)):
-        step[i] = step[i - 1] @ step[i]
+    step = np.empty((*q.shape, 4, 4))
+    step[:] = stack
+    step[..., 0] = x * c + y * s
+    step[..., 1] = y * c - x * s
+    for i in range(1, len(stack)):
+        step[..., i, :, :] = step[..., i - 1, :, :] @ step[..., i, :, :]
     return step
 
 
@@ -275,29 +299,25 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
     return out
 
 
-def _require_same_arm(stack: Array, nominal: Array, name: str, source: str, advice: str) -> None:
-    """Raise InputError where the calibrated flange strays far from the nominal one in some fixed set of postures."""
-    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
-    shift = max(float(np.linalg.norm((joint_frames(stack, q) - joint_frames(nominal, q))[5, :3, 3])) for q in postures)
-    if not shift <= MAX_CALIBRATION_SHIFT_M:
-        raise InputError(f"{source} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: {advice}.")
-
-
 def _read_kinematics(path: Path) -> tuple[Array, str]:
     """Link transforms (6, 4, 4) and the calibration hash of a kinematics file."""
     section = dict(_read(path, "kinematics"))
     fingerprint = str(section.pop("hash", ""))
     for found, wanted, where in [(section, LINKS, "kinematics")] + [
-        (section.get(link), _POSE_KEYS, f"kinematics.{link}") for link in LINKS
+        (section.get(link), POSE_KEYS, f"kinematics.{link}") for link in LINKS
     ]:
         if not isinstance(found, Mapping) or set(found) != set(wanted):
             raise InputError(f"{path.name}: give exactly the keys {', '.join(wanted)} under {where}.")
-    stack = np.tile(np.eye(4), (6, 1, 1))
-    for X, link in zip(stack, LINKS, strict=True):
-        x, y, z, roll, pitch, yaw = (_number(section, link, key, path=path) for key in _POSE_KEYS)
-        X[:3, :3] = _rotation(roll, pitch, yaw)
-        X[:3, 3] = x, y, z
-    return stack, fingerprint
+    rows = ([_number(section, link, key, path=path) for key in POSE_KEYS] for link in LINKS)
+    return np.array([pose_matrix(row) for row in rows]), fingerprint
+
+
+def pose_matrix(row: Sequence[float]) -> Array:
+    """Return the pose (4, 4) of x, y, z (m) and roll, pitch, yaw (rad)."""
+    X = np.eye(4)
+    X[:3, :3] = _rotation(*row[3:])
+    X[:3, 3] = row[:3]
+    return X
 
 
 def _read(path: Path, section: str) -> Mapping[str, Any]:

@@ -5,7 +5,6 @@ A polyline in a CSV file or numbered edges of the part, its direction and its en
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, read_text
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 from weldcal.models.workpieces.drawing import draw_seam
 from weldcal.models.workpieces.seams import JOINTS, DrawnSeam
 from weldcal.models.workpieces.shape import PartShape
@@ -121,11 +121,10 @@ def read_polyline(path: Path) -> tuple[Floats, Floats | None]:
     """
     rows: list[list[float]] = []
     first = True
-    for number, line in enumerate(read_text(path, LARGEST_SEAM_FILE).splitlines(), start=1):
-        text = line.split("#")[0].strip().lstrip("\ufeff")
-        if not text:
-            continue
-        cells = [c for c in re.split(r"[,;\s]+", text) if c]
+    lines = [(k, s.split("#")[0].strip(" \t,;")) for k, s in lines_of(read_text(path, LARGEST_SEAM_FILE), ("#",))]
+    separator = separator_of([text for _, text in lines])
+    for number, text in lines:
+        cells = cells_of(text, separator)
         try:
             row = [float(c) for c in cells]
         except ValueError:

@@ -1,4 +1,4 @@
-"""Read where any arm is, and nothing else: a UR by RTDE, a file, a program, a line over TCP, a driver, or typed numbers."""
+"""Read where any arm is: a UR by RTDE, a file, a program, a line over TCP, a driver, or typed numbers."""
 
 from __future__ import annotations
 

@@ -1,14 +1,17 @@
 """Checks that moves on straight lines in joint space keep the arm clear of the table, the surroundings and itself."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
-from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import LinkCapsule, Surroundings, arm_bodies, path_clearance
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.errors import InputError
+from weldcal.models.tool import WeldingTool
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
@@ -23,12 +26,23 @@ def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
 Joints = NDArray[np.float64]
 
 
-def station_bodies(station: Station) -> list[LinkCapsule]:
+@dataclass(frozen=True, eq=False)
+class BareArm:
+    """What plans of scans need of a station, for an arm that no driver moves."""
+
+    arm: Chain
+    tool: WeldingTool | None
+    surroundings: Surroundings
+
+
+def station_bodies(station: Station | BareArm) -> list[LinkCapsule]:
     """Return the bodies of the clearance checks: the arm's links and its tool."""
     return arm_bodies(station.arm, () if station.tool is None else station.tool.capsules())
 
 
-def clear_move(scenario: Scenario, station: Station, bodies: list[LinkCapsule], q_a: Joints, q_b: Joints) -> bool:
+def clear_move(
+    scenario: Scenario, station: Station | BareArm, bodies: list[LinkCapsule], q_a: Joints, q_b: Joints
+) -> bool:
     """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself.
 
     (6,) rad.
@@ -59,7 +73,7 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
 
 
 def clear_poses(
-    scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[LinkCapsule]
+    scenario: Scenario, station: Station | BareArm, poses: Sequence[PlannedPose], bodies: list[LinkCapsule]
 ) -> tuple[PlannedPose, ...]:
     """Return the poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
 

@@ -1,8 +1,10 @@
 """DriftMonitor: tests a calibration on streamed observations of the flange and says whether the scanner has moved."""
 
+from __future__ import annotations
+
 import copy
 import dataclasses as dc
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -10,169 +12,17 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_correction import (
-    DEVICE,
-    ScannerClock,
-    ScannerCorrection,
-    correction_from_document,
-)
+from weldcal.calibration.data.scanner_correction import ScannerClock, ScannerCorrection, correction_from_document
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest, drift_config
-from weldcal.models.arms.chain import chain_of, chain_poses
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
 from weldcal.systems.motion.buffers import PoseHistory
 
-SEARCHED_S = 0.3  # by which a frame may come later or earlier than usual
-_APART_S = 0.5  # a frame that is this early is of a clock that was set anew; one this late may be late
-_RELEARN_S = 3.0  # frames that stay so late for so long belong to a clock that was set back
-_NEVER_S = 5.0  # no frame is so late
-_STEP_S = 0.02  # of the fit's grid of shifts
-_FEWEST, _MOST = 12, 60  # frames
-_CERTAIN_S = 1e-3  # half of _CONFIRMED_S: two sigma of a learnt shift are what the test lets a known clock be wrong
-_CONFIRMED_S = 2e-3  # as far as the drift test lets a known clock be wrong
-_REST_M = 1e-4  # by which the feature moves in SEARCHED_S at rest
-_ROUNDS = 8
-
-
-@dc.dataclass(frozen=True, eq=False, kw_only=True)
-class RunClock:
-    """A device time and the robot's time then (s), and the robot's rate over the device's.
-
-    ``learnt``: frames in motion have shown it. Until then it is what the calibration's clock says (``known``), which is
-    of another run and another start of the robot's clock, or what the earliest arrival says, wrong by what that frame
-    came late. ``waiting`` are the frames that could not be used yet; ``late_since``: the arrival (s) of the first of
-    those that come very late now.
-    """
-
-    device_s: float
-    robot_s: float
-    rate: float = 1.0
-    known: bool = False
-    learnt: bool = False
-    waiting: tuple[FlangeEstimate, ...] = ()
-    late_since: float | None = None
-
-    def time(self, device_s: float) -> float:
-        """Return a device time on the robot's clock, s."""
-        return self.robot_s + self.rate * (device_s - self.device_s)
-
-
-@dc.dataclass(frozen=True, eq=False)
-class Seen:
-    """What a clock is learnt with.
-
-    The calibration, the arm and where the feature is on its flange, and the arm's recent motion.
-    """
-
-    X_BC: RigidTransform
-    correction: ScannerCorrection
-    arm: ArmModel
-    X_FR: RigidTransform
-    history: PoseHistory
-
-    def features(self, times: Array) -> Array:
-        """Return the feature in the base by the robot (..., 3) m at times (...) s; NaN outside the history."""
-        t, q = self.history.times, self.history.positions
-        if t.size < 2:
-            return np.full((*times.shape, 3), np.nan)
-        flat = times.ravel()
-        joints = np.column_stack([np.interp(flat, t, q[:, k]) for k in range(q.shape[1])])
-        p = (chain_poses(chain_of(self.arm), joints) @ self.X_FR.GetAsMatrix4())[:, :3, 3]
-        p[(flat < t[0]) | (flat > t[-1])] = np.nan
-        return np.asarray(p.reshape(*times.shape, 3))
-
-
-def followed(
-    clock: RunClock | None, estimate: FlangeEstimate, delay_s: float, known: ScannerClock | None
-) -> RunClock | None:
-    """The clock with a new frame's times. ``known`` is the calibration's clock. None where a frame has no device time.
-
-    No frame comes before its time, so that a clock that is not learnt yet moves to the earliest. One that was set anew
-    is learnt again: at once where a frame is too early for it, or later than any frame is, else where frames stay late.
-    """
-    device, arrival = estimate.device_time, estimate.arrival_time
-    if device is None or not np.isfinite(arrival):
-        return None
-    expected = None if known is None else known.capture(arrival, device)
-    by_device = known is not None and known.kind == DEVICE
-    usual = arrival - delay_s if by_device or expected is None else expected
-    rate = 1.0 if known is None else 1.0 + (known.drift or 0.0)
-    late = 0.0 if clock is None else usual - clock.time(device)
-    if clock is None or late >= _NEVER_S or late <= -(_APART_S if clock.learnt else _NEVER_S):
-        if by_device and expected is not None and abs(expected - usual) < SEARCHED_S:
-            return RunClock(device_s=device, robot_s=expected, rate=rate, known=True)
-        return RunClock(device_s=device, robot_s=usual, rate=rate)
-    if not clock.learnt and (abs(late) >= SEARCHED_S if clock.known else late < 0.0):
-        return dc.replace(clock, device_s=device, robot_s=usual, known=False, late_since=None)
-    if late < _APART_S:
-        return clock if clock.late_since is None else dc.replace(clock, late_since=None)
-    if clock.late_since is None:
-        return dc.replace(clock, late_since=arrival)
-    return clock if arrival - clock.late_since < _RELEARN_S else RunClock(device_s=device, robot_s=usual, rate=rate)
-
-
-def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:
-    """Return the clock after a frame with a fit, and the frames that can be used now.
-
-    At rest each at once, because no time is wrong there; in motion those that waited, once they show the clock. One
-    that has left the history is given up. By a clock that is learnt only a very late frame waits, for the next: then it
-    was late, and the clock is right.
-    """
-    assert estimate.device_time is not None
-    if clock.learnt and clock.late_since is not None:
-        return dc.replace(clock, waiting=(*clock.waiting, estimate)), ()
-    if clock.learnt:
-        return dc.replace(clock, waiting=()) if clock.waiting else clock, (*clock.waiting, estimate)
-    time = clock.time(estimate.device_time)
-    around = seen.features(time + np.array([-SEARCHED_S, 0.0, min(SEARCHED_S, seen.history.times[-1] - time)]))
-    if np.linalg.norm(around - around[1], axis=1).max() < _REST_M:
-        return clock, (estimate,)
-    begins = seen.history.times[0] + SEARCHED_S
-    waiting = [f for f in clock.waiting if f.device_time is not None and clock.time(f.device_time) > begins]
-    waiting = [*waiting, estimate][-_MOST:]
-    shift = _shift(clock, waiting, seen) if len(waiting) >= _FEWEST else None
-    if shift is None:
-        return dc.replace(clock, waiting=tuple(waiting)), ()
-    if clock.known and abs(shift) < _CONFIRMED_S:
-        shift = 0.0
-    return dc.replace(clock, robot_s=clock.robot_s + shift, learnt=True, waiting=()), tuple(waiting)
-
-
-def _shift(clock: RunClock, frames: list[FlangeEstimate], seen: Seen) -> float | None:
-    """By how much (s) the robot's time is later than the clock says; None where the frames do not show it.
-
-    The least squares of e_k = X_BC p_C,k - p_BR(t_k + shift) - o, whose common part o takes out a scanner that was
-    moved before: first over steps of _STEP_S, then by Gauss-Newton.
-    """
-    times = np.array([clock.time(f.device_time) for f in frames if f.device_time is not None])
-    centers = np.array([f.fit.center_C for f in frames if f.fit is not None])
-    q = np.array([seen.X_BC @ p for p in seen.correction.points(centers)])
-    shifts = np.arange(-SEARCHED_S, SEARCHED_S + 0.5 * _STEP_S, _STEP_S)
-    e = q - seen.features(times + shifts[:, None])
-    e -= np.nanmean(e, axis=1, keepdims=True)
-    inside = np.isfinite(e[:, :, 0]).all(axis=1)  # a later time may not have been recorded yet
-    if not inside.any():
-        return None
-    spread = np.einsum("dkx,dkx->d", e[inside], e[inside])
-    shift = float(shifts[inside][np.argmin(spread)])
-    for _ in range(_ROUNDS):
-        before, now, after = seen.features(times + shift + np.array([-_HALF_S, 0.0, _HALF_S])[:, None])
-        v = (after - before) / (2.0 * _HALF_S)
-        e, v = q - now, v - v.mean(axis=0)
-        e -= e.mean(axis=0)
-        told = float(np.einsum("kx,kx", v, v))
-        if not np.isfinite(told) or told <= 0.0:
-            return None
-        step = float(np.einsum("kx,kx", v, e)) / told
-        shift += step
-        if abs(step) < 1e-6:
-            break
-    sigma = np.sqrt(float(np.einsum("kx,kx", e, e)) / (3 * len(frames) - 4) / told)
-    return shift if sigma < _CERTAIN_S and abs(shift) <= SEARCHED_S else None
-
+if TYPE_CHECKING:
+    from weldcal.calibration.motion.drift.run_clock import RunClock
 
 _HALF_S = 0.01  # about a capture: its velocity
 _RECENT = 400  # frames that the view shows
@@ -194,7 +44,7 @@ class MonitoredCalibration:
     config: DriftConfig | None = None
 
     @staticmethod
-    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
+    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> MonitoredCalibration:
         """Return the monitored calibration of a result.
 
         ``delay_s`` is the usual delay of the scanner, where the result does not know its clock.
@@ -207,7 +57,7 @@ class MonitoredCalibration:
         return MonitoredCalibration(result.X_BC, result.covariance, correction, clock, delay_s, config)
 
     @staticmethod
-    def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> "MonitoredCalibration | None":
+    def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> MonitoredCalibration | None:
         """Return the calibration that a run has made; None until it is done."""
         e = status.estimate
         if e is None or not status.done:
@@ -365,11 +215,15 @@ def watched_frame(
     c, status = watch.watched, dc.replace(watch.status, sequence=estimate.sequence)
     if c is None or estimate.fit is None:
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
+    from weldcal.calibration.motion.drift.run_clock import SeenMotion, followed, with_frame
+
     waited = 0 if watch.clock is None else len(watch.clock.waiting)
     clock, done = followed(watch.clock, estimate, c.delay_s, c.clock), 1
     usable: tuple[FlangeEstimate, ...] = (estimate,)
     if clock is not None:
-        clock, usable = with_frame(clock, estimate, Seen(c.X_BC, c.correction, arm, X_FR, history))
+        clock, usable = with_frame(
+            clock, estimate, SeenMotion(c.X_BC, c.correction, arm, X_FR, history.times, history.positions)
+        )
         done = waited + 1 - len(clock.waiting)
     tracked = [_tracked(c, f, history, arm, X_FR, clock) for f in usable]
     frames = [f for f in tracked if f is not None]

@@ -181,8 +181,8 @@ def check_arm(scenario: Scenario) -> None:
     if scenario.arm not in known_arms():
         raise InputError(
             f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them."
-            " Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot"
-            " my_arm.urdf."
+            " Other arms, and a URDF, serve recorded data and plans: weldcal calibrate DATASET, and weldcal hand-eye or"
+            " plan-poses with --robot my_arm.urdf."
         )
     payload, robot = get_robot(scenario.arm).payload_kg, scenario.robot
     told = getattr(robot, "payload_kg", None)

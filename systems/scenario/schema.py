@@ -32,7 +32,7 @@ FILE = {"file": True}
 """Metadata of a key that names a file: a relative path is looked for beside the scenario first."""
 
 
-def in_si(order: object, kind: Callable[..., Order], **others: float) -> Order:
+def in_si(order: object, kind: Callable[..., Order], **others: float | None) -> Order:
     """Return the settings of an order's keys of the same names, in SI units, with ``others`` beside them.
 
     Raises what ``kind`` raises for invalid ones.
@@ -217,7 +217,8 @@ class PassOrder:
 
     def weld_pass(self) -> WeldPass:
         """The order as a WeldPass."""
-        return in_si(self, WeldPass)
+        angle = self.travel_angle_deg
+        return in_si(self, WeldPass, travel_rad=None if angle is None else math.radians(angle))
 
 
 @dc.dataclass(kw_only=True)

@@ -20,7 +20,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.places import SHARED_DATA, require_data
-from weldcal.calibration.capture.session import POSES_FILE, ArmPose, Capture, Session, jog
+from weldcal.calibration.capture.session import POSES_FILE, ArmPose, Capture, CaptureSession, jog
 from weldcal.calibration.capture.tasks import BoardTask, FlangeTask
 from weldcal.calibration.data.clouds import read_cloud, save_cloud
 from weldcal.calibration.data.dataset import load_dataset
@@ -32,11 +32,11 @@ FLANGE = "ISO 9409-1-50-4-M6"
 MOVES = ("+x", "+ry", "+y", "-rx", "-z", "+rx", "-x", "-ry")
 
 
-def session(folder: Path) -> Session:
-    return Session(folder, FlangeTask(ROBOT, FLANGE))
+def session(folder: Path) -> CaptureSession:
+    return CaptureSession(folder, FlangeTask(ROBOT, FLANGE))
 
 
-def take(one: Session, cell: DemoCell, scratch: Path, pose: ArmPose | None = None) -> Capture:
+def take(one: CaptureSession, cell: DemoCell, scratch: Path, pose: ArmPose | None = None) -> Capture:
     return one.take(cell.take(scratch), pose or cell.pose())
 
 
@@ -46,7 +46,7 @@ def cell() -> DemoCell:
 
 
 @pytest.fixture
-def begun(tmp_path: Path, cell: DemoCell) -> Session:
+def begun(tmp_path: Path, cell: DemoCell) -> CaptureSession:
     """Three good captures."""
     one = session(tmp_path / "session")
     for move in MOVES[:3]:
@@ -95,7 +95,9 @@ def rotated(X: RigidTransform, angle_deg: float) -> RigidTransform:
     return RigidTransform(X.rotation() @ RotationMatrix(RollPitchYaw(np.radians(angle_deg), 0.0, 0.0)), X.translation())
 
 
-def test_wrong_acts_are_named_at_the_capture_where_they_happen(begun: Session, cell: DemoCell, tmp_path: Path) -> None:
+def test_wrong_acts_are_named_at_the_capture_where_they_happen(
+    begun: CaptureSession, cell: DemoCell, tmp_path: Path
+) -> None:
     now = cell.pose()
     assert now.X_BF is not None
     X = now.X_BF
@@ -158,7 +160,7 @@ def test_numbers_that_are_no_pose_are_refused_before_any_work(
     assert not one.captures
 
 
-def test_another_form_of_pose_is_refused(begun: Session, cell: DemoCell, tmp_path: Path) -> None:
+def test_another_form_of_pose_is_refused(begun: CaptureSession, cell: DemoCell, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="give all in one form"):
         take(begun, cell, tmp_path, ArmPose(numbers=(400.0, 0.0, 300.0, 180.0, 0.0, 90.0)))
 
@@ -178,7 +180,7 @@ def test_typed_poses_in_millimetres_and_degrees_are_read_by_what_the_scans_show(
     assert np.linalg.norm(verdict.X.translation() - cell.X_BC.translation()) < 5e-4
 
 
-def test_a_capture_is_taken_back(begun: Session, cell: DemoCell, tmp_path: Path) -> None:
+def test_a_capture_is_taken_back(begun: CaptureSession, cell: DemoCell, tmp_path: Path) -> None:
     begun.take_back("002")
     assert [c.id for c in begun.captures] == ["001", "003"]
     assert take(begun, cell, tmp_path).id == "004"
@@ -230,7 +232,7 @@ def test_the_odd_one_out_is_named(tmp_path: Path) -> None:
     """Real scans of an AUBO i5; one pose is 4 mm off, which no pair of captures shows by itself."""
     require_data(SHARED_DATA)
     data = load_dataset(SHARED_DATA / "flange" / "aubo_i5_phoxi_s")
-    one = Session(tmp_path, FlangeTask("aubo_i5", data.header.flange))
+    one = CaptureSession(tmp_path, FlangeTask("aubo_i5", data.header.flange))
     for k, id in enumerate(list(data.clouds)[:9]):
         X = data.poses[id]
         wrong = RigidTransform(X.rotation(), X.translation() + np.array([0.0, 0.004, 0.0]))
@@ -296,7 +298,7 @@ def test_pictures_of_a_standing_board_while_the_arm_moves_are_refused(tmp_path: 
     """The camera's old picture, sent again with other noise."""
     rng = np.random.default_rng(1)
     task, one = BoardTask(BOARD, "eye_in_hand"), None
-    s = Session(tmp_path / "s", task)
+    s = CaptureSession(tmp_path / "s", task)
     for k in range(2):
         noisy = np.clip(board_picture(60.0) + rng.normal(0.0, 2.0, (960, 1280)), 0, 255).astype(np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), noisy)

@@ -18,9 +18,9 @@ from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import Emulator, emulator, emulator_process, run_client, start_client
 from tests.hardware.test_emulator_wire import calibrated, chain, kinematics_of, packages
 from tests.ur_rtde import NEEDS_UR_RTDE
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.emulators.ur.controller.poses import rotation_matrix
 from weldcal.tools.emulators.ur.main import HOME
 
 __all__ = ["emulator"]
@@ -376,7 +376,7 @@ def test_a_calibrated_robot_publishes_the_numbers_of_its_own_pose(tmp_path: Path
             X = chain(numbers, q)
             # 1e-16 of the hundreds of metres that cancel, with room
             assert pose[:3] == pytest.approx(X[:3, 3], abs=1e-9)
-            assert np.abs(rotation_matrix(pose[3:]) - X[:3, :3]).max() < 1e-9
+            assert np.abs(exp_rotation(np.array(pose[3:])) - X[:3, :3]).max() < 1e-9
         assert np.linalg.norm(pose[:3] - forward_kinematics(load_arm(), q).translation()) > 1e-4  # not the nominal arm
 
 

@@ -15,9 +15,9 @@ import pytest
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
+from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.emulators.ur.controller.poses import dh_parameters
 from weldcal.tools.emulators.ur.wire.rtde_fields import inputs, outputs
 
 
@@ -278,8 +278,7 @@ def calibrated(folder: Path) -> Path:
 
 def test_a_calibrated_chain_is_written_as_a_robot_writes_it(tmp_path: Path) -> None:
     arm = load_arm("ur10e", calibrated(tmp_path))
-    dh = dh_parameters(arm)
-    numbers = np.array([dh.theta, dh.a, dh.d, dh.alpha])
+    numbers = dh_parameters(arm).T[[3, 0, 2, 1]]  # theta, a, d, alpha
     assert np.abs(numbers[2, 1:4]).max() > 100.0
     for q in np.random.default_rng(0).uniform(-3, 3, (20, 6)):
         # rounding of lengths that cancel: 1e-16 of up to 1 km
@@ -288,8 +287,8 @@ def test_a_calibrated_chain_is_written_as_a_robot_writes_it(tmp_path: Path) -> N
 
 
 def test_nominal_numbers_come_out_as_they_are_published() -> None:
-    dh, half = dh_parameters(load_arm()), np.pi / 2.0
-    assert np.array([dh.theta, dh.a, dh.d, dh.alpha]) == pytest.approx(
+    half = np.pi / 2.0
+    assert dh_parameters(load_arm()).T[[3, 0, 2, 1]] == pytest.approx(
         np.array(
             [
                 [0.0] * 6,

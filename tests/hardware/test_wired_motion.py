@@ -49,8 +49,8 @@ def calibrated(wired: tuple[Played, str, Path], tmp_path_factory: pytest.TempPat
 
 
 def test_pose_and_clock_are_those_of_the_truth_file(wired: tuple[Played, str, Path], calibrated: MotionOutcome) -> None:
-    truth, e = wired[0].truth(), calibrated.estimate
-    assert e is not None, calibrated.run.reason
+    assert calibrated.report is not None, calibrated.run.reason
+    truth, e = wired[0].truth(), calibrated.report.estimate
     assert calibrated.run.cell.station.world is None
     X_BC, p = RigidTransform(np.array(truth["X_BC"])), np.array([0.65, 0.0, 0.30])
     assert 1e3 * np.linalg.norm(e.X_BC @ (X_BC.inverse() @ p) - p) < 0.2

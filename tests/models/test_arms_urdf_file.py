@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.models.arms.chain import chain_forward, chain_inverse, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.arms.shape import arm_capsules
+from weldcal.models.arms.urdf import arm_urdf, link_solids
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_chain
 
@@ -48,7 +50,7 @@ def test_our_own_urdf_is_the_arm_again(tmp_path: Path) -> None:
     assert chain.position_upper == pytest.approx(arm.position_upper)
     assert chain.velocity_limit == pytest.approx(arm.velocity_limit)
     for q in np.random.default_rng(0).uniform(-2.0, 2.0, (5, 6)):
-        assert chain_forward(chain, q).IsNearlyEqualTo(forward_kinematics(arm, q), 1e-9)
+        assert forward_kinematics(chain, q).IsNearlyEqualTo(forward_kinematics(arm, q), 1e-9)
 
 
 def test_axes_bases_and_grippers_of_other_makers(tmp_path: Path) -> None:
@@ -64,12 +66,14 @@ def test_axes_bases_and_grippers_of_other_makers(tmp_path: Path) -> None:
     p = p + R @ [0.1, 0.0, 0.2]
     R = R @ rotation([0, 0, 1], 1.1)
     p, R = p + R @ [0.0, 0.0, 0.1], R @ rotation([0, 0, 1], 0.5)
-    found = chain_forward(chain, q)
+    found = forward_kinematics(chain, q)
     assert found.translation() == pytest.approx(p)
     assert found.rotation().matrix() == pytest.approx(R)
-    again = chain_inverse(chain, found, q + 0.05)
+    again = nearest_solution(chain, found, q + 0.05)
     assert again is not None
-    assert chain_forward(chain, again).IsNearlyEqualTo(found, 1e-7)
+    assert forward_kinematics(chain, again).IsNearlyEqualTo(found, 1e-7)
+    # three joints have one way or a few to a pose that they reach
+    assert min(np.abs(one - q).max() for one in inverse_kinematics(chain, found)) < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -106,3 +110,25 @@ def test_several_ends_need_a_name(tmp_path: Path) -> None:
         load_chain(str(file))
     with pytest.raises(InputError, match="There is no file"):
         load_chain("none.urdf")
+
+
+def test_capsules_enclose_the_shapes_of_a_urdf(tmp_path: Path) -> None:
+    file = tmp_path / "mine.urdf"
+    file.write_text(arm_urdf(load_arm("ur5e")))
+    arm, chain = load_arm("ur5e"), load_chain(str(file))
+    capsules = arm_capsules(chain)
+    assert {c.link_index for c in capsules} == set(range(7))
+    for link in range(7):
+        for solid in link_solids(arm, link):
+            far = np.inf
+            for c in (c for c in capsules if c.link_index == link):
+                axis = c.p_end - c.p_start
+                share = np.clip((solid.vertices - c.p_start) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0)
+                far = min(
+                    far,
+                    float(
+                        (np.linalg.norm(solid.vertices - c.p_start - share[:, None] * axis, axis=1) - c.radius).max()
+                    ),
+                )
+            assert far < 1e-9
+    assert sum(c.radius for c in capsules) < 0.08 * len(capsules)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
-from weldcal.models.arms.chain import chain_forward, chain_inverse, chain_jacobian, load_chain
-from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
+from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
-from weldcal.models.robots import CLOSED_FORM, FACTS, ROBOTS, get_robot
+from weldcal.models.robots import FACTS, ROBOTS, get_robot
 from weldcal.models.scanners import SCANNERS
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def test_a_ur_arm_stands_where_its_published_dh_table_puts_it(name: str) -> None
         a, d, alpha = (0, a2, a3, 0, 0, 0), (d1, 0, 0, d4, d5, d6), (half, 0, 0, half, -half, 0)
         wanted = standard_dh(list(zip(a, d, alpha, q, strict=True)))
         assert np.abs(forward_kinematics(arm, q).GetAsMatrix4() - wanted).max() < 1e-12
-        assert np.abs(chain_forward(load_chain(name), q).GetAsMatrix4() - wanted).max() < 1e-12
+        assert np.abs(forward_kinematics(load_chain(name), q).GetAsMatrix4() - wanted).max() < 1e-12
     assert (arm.dh.d1, arm.dh.a2, arm.dh.a3, arm.dh.d4, arm.dh.d5, arm.dh.d6) == UR_DH[name]
 
 
@@ -93,15 +93,15 @@ def test_a_franka_stands_where_the_fci_documentation_puts_it(name: str) -> None:
     chain = load_chain(name)
     for q in np.random.default_rng(1).uniform(chain.position_lower, chain.position_upper, (5, 7)):
         wanted = craig_dh(list(zip(a, d, alpha, (*q, 0.0), strict=True)))
-        assert np.abs(chain_forward(chain, q).GetAsMatrix4() - wanted).max() < 1e-12
+        assert np.abs(forward_kinematics(chain, q).GetAsMatrix4() - wanted).max() < 1e-12
     # upright, all links in one line but for the offset of the last wrist: 0.333 + 0.316 + 0.384 - 0.107
-    assert np.allclose(chain_forward(chain, np.zeros(7)).translation(), [0.088, 0.0, 0.926], atol=1e-12)
+    assert np.allclose(forward_kinematics(chain, np.zeros(7)).translation(), [0.088, 0.0, 0.926], atol=1e-12)
 
 
 def test_the_aubo_stands_where_its_lengths_put_it() -> None:
     chain = load_chain("aubo_i5")
     # upright at zero: the lengths of tubes and wrists add up, the joints' offsets lie sideways
-    p = chain_forward(chain, np.zeros(6)).translation()
+    p = forward_kinematics(chain, np.zeros(6)).translation()
     assert p[2] == pytest.approx(0.122 + 0.408 + 0.376 + 0.1025, abs=1e-9)
     assert np.hypot(p[0], p[1]) == pytest.approx(0.1215 + 0.094, abs=1e-9)
     # the maker's reach is that of tubes and first wrist: a second source for the three lengths
@@ -115,7 +115,7 @@ def test_nothing_reaches_much_farther_or_less_far_than_its_maker_says(name: str)
     rng = np.random.default_rng(2)
     shoulder = chain.stack[0, :3, 3]
     far = max(
-        float(np.linalg.norm(chain_forward(chain, q).translation() - shoulder))
+        float(np.linalg.norm(forward_kinematics(chain, q).translation() - shoulder))
         for q in rng.uniform(chain.position_lower, chain.position_upper, (800, chain.n))
     )
     # the makers' radius is to the wrist or less, the flange hangs up to two wrists farther out
@@ -129,35 +129,34 @@ def test_the_jacobian_is_the_derivative_and_the_numeric_solver_arrives(name: str
     rng = np.random.default_rng(3)
     middle = 0.5 * (np.maximum(chain.position_lower, -2) + np.minimum(chain.position_upper, 2))
     q = middle + 0.4 * rng.standard_normal(chain.n)
-    J, h = chain_jacobian(chain, q), 1e-6
+    J, h = jacobian(chain, q), 1e-6
     for k in range(chain.n):
         e = h * np.eye(chain.n)[k]
-        a, b = chain_forward(chain, q - e), chain_forward(chain, q + e)
+        a, b = forward_kinematics(chain, q - e), forward_kinematics(chain, q + e)
         turn = (b.rotation() @ a.rotation().inverse()).ToAngleAxis()
         assert np.allclose(turn.axis() * turn.angle() / (2 * h), J[:3, k], atol=1e-6)
         assert np.allclose((b.translation() - a.translation()) / (2 * h), J[3:, k], atol=1e-6)
-    X = chain_forward(chain, q)
-    found = chain_inverse(chain, X)
-    assert found is not None
-    assert np.abs(chain_forward(chain, found).GetAsMatrix4() - X.GetAsMatrix4()).max() < 1e-8
+    X = forward_kinematics(chain, q)
+    found = inverse_kinematics(chain, X)[0]
+    assert np.abs(forward_kinematics(chain, found).GetAsMatrix4() - X.GetAsMatrix4()).max() < 1e-8
     assert (found >= chain.position_lower).all()
     assert (found <= chain.position_upper).all()
-    near = chain_inverse(chain, X, q + 0.02)
+    near = nearest_solution(chain, X, q + 0.02)
     assert near is not None
     assert np.abs(near - q).max() < 0.2
 
 
 def test_a_pose_out_of_reach_has_no_joint_angles() -> None:
-    assert chain_inverse(load_chain("aubo_i5"), RigidTransform(RotationMatrix(), [3.0, 0.0, 0.0])) is None
+    assert not len(inverse_kinematics(load_chain("aubo_i5"), RigidTransform(RotationMatrix(), [3.0, 0.0, 0.0])))
     with pytest.raises(InputError, match="finite"):
-        chain_inverse(load_chain("aubo_i5"), RigidTransform([np.inf, 0.0, 0.0]))
+        inverse_kinematics(load_chain("aubo_i5"), RigidTransform([np.inf, 0.0, 0.0]))
 
 
 def test_every_robot_has_a_flange_and_known_names_are_told() -> None:
     for robot in ROBOTS.values():
         large = robot.name in ("ur20", "ur30")
         assert robot.standard.designation == ("iso9409-1-80-6-m8" if large else "iso9409-1-50-4-m6")
-        assert (robot.inverse == CLOSED_FORM) == robot.name.startswith("ur")
+        assert (robot.inverse == "all") == (not robot.name.startswith("franka"))
     assert get_robot("franka").name == "franka_panda"
     assert get_robot("UR10e").payload_kg == 12.5
     with pytest.raises(InputError, match="use one of ur3e"):

@@ -26,13 +26,14 @@ from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_datas
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.models.arms.chain import chain_inverse, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.mounting_live import calibrate_carried
+from weldcal.tools.commands.mounting_live import calibrate_recorded
 from weldcal.tools.recorded import calibrate_dataset
 
 SECONDS, EVERY = 12.0, 3
@@ -64,7 +65,7 @@ def hand_moves(
         R_BC = Rotation.from_euler("zxy", [lean[0], np.pi + lean[1], lean[2]]).as_matrix()
         p = X_BT.translation() - rng.uniform(0.5, 0.62) * R_BC[:, 2] + spread_m * rng.uniform(-1.0, 1.0, 3)
         X_BF = RigidTransform(RotationMatrix(R_BC), p) @ X_FC.inverse()
-        found = chain_inverse(chain, X_BF, near)
+        found = nearest_solution(chain, X_BF, near)
         if found is not None:
             near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
             q.append(near)
@@ -141,7 +142,7 @@ def test_without_turns_the_pose_is_open() -> None:
 @pytest.mark.parametrize("scale", [1.0, 0.998])
 def test_scans_at_rest_of_the_foot_place_a_scanner_on_the_wrist(tmp_path: Path, scale: float) -> None:
     """Scans of an independent ray caster, of a true scanner and of one that measures 0.2 % short."""
-    report = calibrate_carried(write_wrist_scans(tmp_path / "scans", scale), tmp_path / "out", limit_mm=0.8)
+    report = calibrate_recorded(write_wrist_scans(tmp_path / "scans", scale), tmp_path / "out", limit_mm=0.8)
     result = report.result
     assert result is not None
     assert len(report.status.seen) == len(WRIST_POSES)
@@ -163,12 +164,12 @@ def test_a_wrong_guess_is_named_with_its_distance(tmp_path: Path) -> None:
     with pytest.raises(
         TooFewPoses, match=r"a circle lies \d+ mm .* or write radius_m: 0.25 in scanner_guess"
     ) as caught:
-        calibrate_carried(folder, tmp_path / "out")
+        calibrate_recorded(folder, tmp_path / "out")
     off = int(re.findall(r"lies (\d+) mm", str(caught.value))[0])
     assert 270 <= off <= 330
     header["scanner_guess"]["radius_m"] = 0.25
     (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
-    report = calibrate_carried(folder, tmp_path / "out")
+    report = calibrate_recorded(folder, tmp_path / "out")
     assert report.result is not None
     assert np.linalg.norm(report.result.X.translation() - X_WRIST.translation()) < 2e-4
 
@@ -179,7 +180,7 @@ def test_a_missing_joint_angle_is_named(tmp_path: Path) -> None:
     lines = [f"{first},q1,q2,elbow,q4,q5,q6", *(f"{row},0.1,0.1,0.1,0.1,0.1,0.1" for row in rows)]
     (folder / "poses.csv").write_text("\n".join(lines))
     with pytest.raises(DatasetError, match="has no q3 of '"):
-        calibrate_carried(folder, tmp_path / "out")
+        calibrate_recorded(folder, tmp_path / "out")
 
 
 def test_a_link_that_does_not_carry_the_scanner_is_refused(tmp_path: Path) -> None:
@@ -187,4 +188,4 @@ def test_a_link_that_does_not_carry_the_scanner_is_refused(tmp_path: Path) -> No
     header = yaml.safe_load((folder / "dataset.yaml").read_text()) | {"scanner_link": "forearm"}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
     with pytest.raises(InputError, match="Remove scanner_link"):
-        calibrate_carried(folder, tmp_path / "out")
+        calibrate_recorded(folder, tmp_path / "out")

@@ -25,7 +25,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.calibrate_motion import calibrate_motion
+from weldcal.tools.commands.calibrate_motion import calibrate_recording
 
 SECONDS = 6.0
 FLANGE = "iso9409-1-50-4-m6"
@@ -98,7 +98,7 @@ def test_arrivals(recording: tuple[Path, RigidTransform], tmp_path: Path) -> Non
     copy = shutil.copytree(folder, tmp_path / "copy")
     rows = [line.rsplit(",", 1)[0] for line in (copy / "frames.csv").read_text().splitlines()]
     (copy / "frames.csv").write_text("\n".join([rows[0], *rows[:0:-1]]))
-    report = calibrate_motion(copy, tmp_path / "out")
+    report = calibrate_recording(copy, tmp_path / "out")
     clock = report.estimate.clock
     assert clock.kind == "arrival"
     assert clock.offset_s is not None
@@ -114,13 +114,13 @@ def test_refusals(recording: tuple[Path, RigidTransform], tmp_path: Path) -> Non
     head, *rows = (copy / "frames.csv").read_text().splitlines()
     (copy / "frames.csv").write_text("\n".join([head, *rows[:4]]))
     with pytest.raises(TooFewPoses, match="4 frames"):
-        calibrate_motion(copy, tmp_path / "out")
+        calibrate_recording(copy, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError):
-        calibrate_motion(copy, tmp_path / "out", flange="iso9409-1-80-6-m8")
+        calibrate_recording(copy, tmp_path / "out", flange="iso9409-1-80-6-m8")
     text = (copy / "dataset.yaml").read_text()
     (copy / "dataset.yaml").write_text(text.replace("mode: motion", "mode: static"))
     with pytest.raises(DatasetError, match="no recording in motion"):
-        calibrate_motion(copy, tmp_path / "out")
+        calibrate_recording(copy, tmp_path / "out")
     ran = CliRunner().invoke(app, ["calibrate", str(folder), "--poses", "a:b", "--out", str(tmp_path / "out")])
     assert ran.exit_code == 2

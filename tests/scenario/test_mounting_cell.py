@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.planning.mounting_poses import work_point
+from weldcal.calibration.recorded_carried import calibrate_carried
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.jobs.mounting.job import mounting_scene
@@ -28,7 +30,7 @@ from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.mounting_live import calibrate_carried, run_mounting_live
+from weldcal.tools.commands.mounting_live import live_report, run_mounting_live, write_mounting
 from weldcal.tools.commands.run import JobRun
 from weldcal.tools.procedure import kind_of
 from weldcal.tools.report.mounting import MountingReport
@@ -57,29 +59,30 @@ def ideal_short(name: str) -> Scenario:
 @cache
 def finished(name: str) -> MountingReport:
     """A run as the command has it, before anything is written."""
-    return MountingReport(run_cell(build_cell(ideal_short(name), SEED)), None, Path(), 0.0)
+    run = run_cell(build_cell(ideal_short(name), SEED))
+    return live_report(JobRun(run, None, "simulated"), Path(), time.monotonic())
 
 
 @pytest.mark.parametrize("name", list(SHORT))
 def test_what_is_sought_is_found_where_it_truly_is(name: str) -> None:
     run = finished(name)
     result = run.status.result
-    assert not run.run.held, run.run.reason
-    assert result is not None, run.status.message
-    assert set(result.poses) == set(run.job.truth) == ({"X", "Y"} if name == "co_manipulation" else {"X"})
+    assert run.state == "done", run.reason
+    assert result is not None
+    assert set(result.poses) == set(run.truth) == ({"X", "Y"} if name == "co_manipulation" else {"X"})
     assert result.unobservable == ()
-    for letter, truth in run.job.truth.items():
+    for letter, truth in run.truth.items():
         assert result.normalised_error(letter, truth) < result.region(0.9973)  # three sigma
         # a pixel is about a millimetre; an edge of hundreds of them places a centre to a tenth of one
         if (
             letter == "X"
         ):  # pose and correction go together: few scans in a small region do not separate them, a scanned point needs both
-            p = work_point(run.job.scene)
+            p = work_point(run.scene)
             assert np.linalg.norm(result.place(p) - truth @ p) < 3e-4
         else:
             assert np.linalg.norm(result.poses[letter].translation() - truth.translation()) < 3e-4
     # the tape measure was off by 8 mm and more
-    assert np.linalg.norm(run.job.scene.X_LC.translation() - run.job.truth["X"].translation()) > 7e-3
+    assert np.linalg.norm(run.scene.X_LC.translation() - run.truth["X"].translation()) > 7e-3
 
 
 @pytest.mark.parametrize("name", list(SHORT))
@@ -94,18 +97,18 @@ def test_the_next_best_pose_is_new_and_would_help(name: str) -> None:
     run = finished(name)
     best = run.status.next_best
     assert best is not None
-    assert best.sigma_after_m < best.sigma_before_m
+    assert best.after_m < best.before_m
     assert min(np.abs(best.q - s.pose.q).max() for s in run.status.seen) > np.radians(0.5)
-    assert run.job.scene.seen(best.q, best.q_2).translation()[2] > 0.3  # before the scanner
+    assert run.scene.seen(best.q, best.q_2).translation()[2] > 0.3  # before the scanner
 
 
 def test_a_circle_of_unknown_place_leaves_its_turn_about_its_own_normal_open_and_nothing_else() -> None:
     run = finished("eye_in_hand")
-    scene = replace(run.job.scene, target_known=False)
+    scene = replace(run.scene, target_known=False)
     result = solve_mounting(scene, run.status.seen)
     (name,) = result.unobservable
     assert name == "rotation about (+0.00, +0.00, +1.00): pose of the target in the base frame: X_BM"
-    assert result.normalised_error("X", run.job.truth["X"]) < result.region(0.9973)
+    assert result.normalised_error("X", run.truth["X"]) < result.region(0.9973)
     assert result.covariance["Y"][2, 2] > 1.0  # rad^2: not a confident number
     assert np.linalg.norm(result.Y.translation() - scene.X_HR.translation()) < 1e-3
 
@@ -113,7 +116,7 @@ def test_a_circle_of_unknown_place_leaves_its_turn_about_its_own_normal_open_and
 def test_the_first_joint_shows_the_foot_no_other_side() -> None:
     """The base circle turns about the first joint's own axis: a scanner on the arm sees the same, wherever that joint
     is."""
-    scene, _ = mounting_scene(ideal_short("eye_on_arm_base"), finished("eye_on_arm_base").job.scene.arm)
+    _, scene, _ = mounting_scene(ideal_short("eye_on_arm_base"), finished("eye_on_arm_base").scene.arm)
     q = scene.q_home
     turned = q + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     a, b = scene.seen(q), scene.seen(turned)
@@ -124,13 +127,9 @@ def test_the_first_joint_shows_the_foot_no_other_side() -> None:
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> MountingReport:
     """The command's own way from the same run to files."""
-    from weldcal.tools.commands import mounting_live
-
-    run = finished("eye_on_arm")
-    folder = tmp_path_factory.mktemp("live")
-    result = solve_mounting(run.job.scene, run.status.seen, folds=3)
-    made = MountingReport(run.run, result, folder, 1.0)
-    mounting_live.write_mounting(made, JobRun(run.run, None, "simulated"))
+    made = replace(finished("eye_on_arm"), folder=tmp_path_factory.mktemp("live"))
+    assert made.run is not None
+    write_mounting(made, JobRun(made.run, None, "simulated"))
     return made
 
 
@@ -195,7 +194,7 @@ def test_a_dataset_that_lacks_something_says_what(
     assert line in text
     (folder / "dataset.yaml").write_text(text.replace(line, other))
     with pytest.raises(InputError, match=match):
-        calibrate_carried(folder, tmp_path / "out")
+        calibrate_carried(folder)
 
 
 def test_other_commands_refuse_scans_of_a_carried_scanner(report: MountingReport) -> None:
@@ -262,7 +261,9 @@ class Alone:
 
 @pytest.fixture
 def alone() -> Alone:
-    job = finished("co_manipulation").job
+    run = finished("co_manipulation").run
+    assert run is not None
+    job = run.cell.job
     home = (job.scene.q_home, job.scene.q_home_2)
     procedure = MountingProcedure(job.plan[:3], 2, 1, home, maximum_time_s=60.0)
     made = Alone(Simulator(procedure), procedure)
@@ -329,6 +330,6 @@ def test_a_second_base_is_drawn_from_the_seed_and_the_first_world_stays_as_it_wa
     truth = finished("co_manipulation").run.cell.station.truth
     assert truth.X_BC is None
     assert truth.X_BD is not None
-    drawn = finished("co_manipulation").job.scene.X_BD
+    drawn = finished("co_manipulation").run.cell.job.scene.X_BD
     assert isinstance(drawn, RigidTransform)
     assert np.linalg.norm(truth.X_BD.translation() - drawn.translation()) == pytest.approx(0.015)

@@ -8,8 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, pose
-from weldcal.models.arms.chain import Chain
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import ArmModel, Chain
 from weldcal.models.arrays import Array
 
 HOME = np.radians([20.0, -80.0, 105.0, -115.0, -90.0, 30.0])

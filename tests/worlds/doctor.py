@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from tests.worlds.cell import HOME, SPREAD_RAD, visible, wrong_arm
 from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.models.arms.chain import Chain, chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import Chain, chain_poses
 from weldcal.models.arrays import Array
 from weldcal.tools.report.render import csv_text
 

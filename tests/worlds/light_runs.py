@@ -184,8 +184,8 @@ class MountedWorld:
 def mounted_plan(name: str) -> tuple[Scenario, MountingScene, float, tuple[MountingPose, ...]]:
     """Return a mounting's scenario by name, its scene, the radius of its circle's face (m), and the planned poses."""
     scenario = load_scenario(name)
-    scene, standard = mounting_scene(scenario, load_arm(scenario.arm))
-    return scenario, scene, 0.9 * standard.outer_radius_m, plan_mounting(scenario, scene, 0)
+    _, scene, circle = mounting_scene(scenario, load_arm(scenario.arm))
+    return scenario, scene, 0.9 * circle.standard.outer_radius_m, plan_mounting(scenario, scene, 0)
 
 
 def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorld:

@@ -11,9 +11,9 @@ from tests.worlds.streams import ROBOT, Moves, closed_moves
 from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, inverse, rotation_vector
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
 from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.models.arms.chain import chain_inverse, chain_of, chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import chain_poses, load_arm
 from weldcal.models.arrays import Array
 
 CUBE_M = 0.2  # edge
@@ -43,7 +43,7 @@ def cube_moves(
     for corner in CORNERS:
         lean = np.radians(tilt_deg) * rng.uniform(-1.0, 1.0, 2)
         R = Rotation.from_euler("zxy", [turn, *lean]).as_matrix()
-        found = chain_inverse(chain, RigidTransform(RotationMatrix(R), middle + corner - 0.5 * CUBE_M), near)
+        found = nearest_solution(chain, RigidTransform(RotationMatrix(R), middle + corner - 0.5 * CUBE_M), near)
         assert found is not None
         near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
         q.append(near)
@@ -328,7 +328,7 @@ def _loop(config: WorldConfig, towards: Array, rng: np.random.Generator) -> Arra
             continue
         goals.append(q)
         near = goals[0]
-    places = chain_poses(chain_of(arm), np.array(goals))[:, :3, 3]
+    places = chain_poses(arm, np.array(goals))[:, :3, 3]
     out = []
     for k in range(len(goals)):
         j = (k + 1) % len(goals)

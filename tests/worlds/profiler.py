@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
@@ -88,7 +89,7 @@ def ur10e_cell() -> ProfilerCell:
     """Return a UR10e."""
     center = np.array([-0.75, 0.12, 0.18])
     return ProfilerCell(
-        arm=DhArm.of(load_arm("ur10e")),
+        arm=DhArm(dh_parameters(load_arm("ur10e"))),
         home=np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0]),
         center=center,
         groove=np.array([-0.75, -0.03, 0.15]),

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.geometry.se3 import as_transform, pose
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.inverse import continued_solution
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import chain_poses, load_arm
 from weldcal.models.arrays import Array
 
 ROBOT = "ur10e"

@@ -31,7 +31,8 @@ from weldcal.calibration.refinement.kinematics_fit import (
     informative_poses,
     unsought,
 )
-from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import device_warp
 

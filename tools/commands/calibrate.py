@@ -99,7 +99,17 @@ def calibrate(
             )
         from weldcal.tools.commands.calibrate_motion import calibrate_recording
 
-        return calibrate_recording(call, dataset, robot, flange, centres=centres, limit_mm=limit_mm)
+        moving = calibrate_recording(
+            dataset,
+            call.folder("calibrate", dataset.resolve().name),
+            robot=robot,
+            flange=flange,
+            seed=call.seed,
+            progress=call.progress,
+            centres=centres,
+            limit_mm=limit_mm,
+        )
+        return Outcome(moving.summary(), first=moving.first)
     if is_carried(dataset):
         if axis_turn is not None or refine is not None or compare or centres or not scanner_correction:
             raise typer.BadParameter(
@@ -108,7 +118,12 @@ def calibrate(
             )
         from weldcal.tools.commands.mounting_live import calibrate_recorded
 
-        return calibrate_recorded(call, dataset, robot, flange, poses=poses, limit_mm=limit_mm)
+        out, known = (
+            call.folder("calibrate", dataset.resolve().name),
+            {"robot": robot, "flange": flange, "poses": poses},
+        )
+        carried = calibrate_recorded(dataset, out, **known, limit_mm=limit_mm, progress=call.progress)
+        return Outcome(carried.summary(), text=carried.text(), first=carried.first)
     asked = FlangeOptions(
         robot=robot,
         flange=flange,

@@ -1,4 +1,4 @@
-"""weldcal capture: scans or pictures at a robot that is jogged by hand, with a page that judges each of them at once."""
+"""weldcal capture: scans or pictures at a robot that is jogged by hand; a page judges each at once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from weldcal.calibration.capture.session import Session, Task
+from weldcal.calibration.capture.session import CaptureSession, CaptureTask
 from weldcal.calibration.capture.tasks import BoardTask, FlangeTask
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
@@ -62,8 +62,8 @@ def capture(
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
-    task: Task = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
-    run = CaptureRun(Session(out, task), arm, sensor, required_mm, "weldcal capture")
+    task: CaptureTask = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
+    run = CaptureRun(CaptureSession(out, task), arm, sensor, required_mm, "weldcal capture")
     with closing(run):
         _serve(run, call.live["browser"])
     return {"state": "done", "folder": str(out), "captures": len(run.session.captures), "next": task.command(out)}
@@ -98,8 +98,8 @@ def _sensor(scenario: str | None, watch: Path | None, webcam: str | None) -> Sen
     """Return what takes the scans or pictures. Raises InputError where none, or several, are named."""
     if sum(one is not None for one in (scenario, watch, webcam)) != 1:
         raise InputError(
-            "Name one sensor: --watch FOLDER, into which its own program writes; --webcam N; a scenario with its driver;"
-            " or --demo."
+            "Name one sensor: --watch FOLDER, into which its own program writes; --webcam N; a scenario with its"
+            " driver; or --demo."
         )
     if watch is not None:
         return FolderSensor(watch)

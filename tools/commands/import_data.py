@@ -18,8 +18,9 @@ from weldcal.calibration.data.header import Units
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import fit_flanges
-from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
+from weldcal.calibration.recorded_hand_eye import pairs_or_streams
 from weldcal.calibration.verified_pairs import holds_scans
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -154,7 +155,7 @@ def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: S
 
     def read(mode: str | None) -> PosePairs:
         if len(sources) == 1:
-            return read_pairs(sources[0], mounting=mode, length=unit, stated=stated)
+            return pairs_or_streams(sources[0], mounting=mode, unit=unit, stated=stated)[0]
         lists = [folder_lists(one) if one.is_dir() else read_lists(one) for one in sources]
         names = " and ".join(one.name for one in sources)
         forms = stated

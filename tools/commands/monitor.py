@@ -412,12 +412,8 @@ def monitor_live(
     collected, arm = added.record(finished.run.root), finished.cell.station.arm
     data: MotionDataset | None = None
     if added.recorder is not None and collected.seen:
-        added.recorder.finish(
-            posed_stream(collected, arm),
-            scenario.arm,
-            feature_standard(scenario).designation,
-            scenario.scanner.scanner(),  # type: ignore[attr-defined]
-        )
+        header = replace(added.header, flange=feature_standard(scenario).designation)
+        added.recorder.finish(posed_stream(collected, arm), header)
         data = load_motion_dataset(options.out / "recording")
     report = None
     if collected.seen:

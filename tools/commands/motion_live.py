@@ -1,13 +1,11 @@
 """Run the motion job: calibrate a streaming scanner and its clock live, and compare with the truth."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result, statistics
-from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
 from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
@@ -17,20 +15,24 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
-from weldcal.tools.report.motion_calibration import motion_result, motion_screen
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.page import TableRows, page_html
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.run import RunOptions, robot_timing
+from weldcal.tools.report.render import save_all, write_atomic
+from weldcal.tools.report.run import RunOptions, robot_timing, run_document
+
+_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
+_SHARED = ("X_BC", "covariance", "clock", "clock_offset_ms", "clock_offset_sigma_ms", "rms_mm")
+"""Keys of the JSON object as `calibrate` has them."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionOutcome:
-    """The run of a motion job, its estimate (None: there is none) and what was collected."""
+    """The run of a motion job, its calibration (None: there is none) and what was collected."""
 
     options: RunOptions
     finished: JobRun
     record: MotionRecord
-    estimate: MotionEstimate | None
+    report: MotionReport | None
 
     @property
     def run(self) -> Run[AddedMotion]:
@@ -61,33 +63,29 @@ class MotionOutcome:
         return {int(n): float(t) - behind for n, t in zip(numbers, times, strict=True) if n}
 
     @property
+    def against(self) -> tuple[str, ...]:
+        """Why the job was held."""
+        return (self.run.reason or "The job was held.",) if self.run.held else ()
+
+    @property
     def first(self) -> FirstScreen:
-        """The first screen: of the estimate as `calibrate` gives it on the same recording."""
-        e, run = self.estimate, self.run
-        against = [run.reason or "The job was held."] if run.held else []
-        if e is None:
-            expected = ExpectedError("error in the middle of the frames, 95 %", "not known", "there is no calibration")
-            found = Findings(against=against or ["There is no calibration."], unseen=0)
-            return FirstScreen(found, expected, after_hold(run.ended_by_operator), more={"pose": "none was found"})
-        seen = self.record.seen
-        p_C = np.array([fit.center_C for _, fit in seen])
-        return motion_screen(
-            calibration_result(self, e),
-            e,
-            p_C,
-            self.record.refused,
-            self.folder,
-            None,
-            against,
-            "No scenario key states the error that is allowed: compare it with what your job allows.",
-        )
+        """The first screen: of the calibration as `calibrate` gives it on the same recording."""
+        if self.report is not None:
+            return self.report.first
+        expected = ExpectedError("error in the middle of the frames, 95 %", "not known", "there is no calibration")
+        found = Findings(against=self.against or ("There is no calibration.",), unseen=0)
+        return FirstScreen(found, expected, after_hold(self.run.ended_by_operator), more={"pose": "none was found"})
 
     def truth(self) -> dict[str, object]:
         """Errors against the simulation: X_BC at the cube's centre, and the clock's offset (mean over the frames)."""
-        X_BC, captures, e = self.run.cell.station.truth.X_BC, self.true_captures(), self.estimate
-        job = self.run.cell.scenario.part(MotionJob)
-        if X_BC is None or e is None or job is None:
+        X_BC, captures, job = (
+            self.run.cell.station.truth.X_BC,
+            self.true_captures(),
+            self.run.cell.scenario.part(MotionJob),
+        )
+        if X_BC is None or self.report is None or job is None:
             return {}
+        e = self.report.estimate
         p_C = X_BC.inverse() @ np.array(job.centre_m)
         turn = (X_BC.inverse() @ e.X_BC).rotation().ToAngleAxis().angle()
         found: dict[str, object] = {
@@ -108,34 +106,19 @@ class MotionOutcome:
 
     def summary(self) -> dict[str, object]:
         """Return the JSON object."""
-        run, e = self.run, self.estimate
+        run = self.run
         taken, dropped = run.cell.job.counts(run.root)
-        found: dict[str, object] = {
-            "state": "held" if run.held else "done",
+        found = run_document(run, self.options, self.finished.robot) | {
             "mode": "motion",
-            "scenario": self.options.scenario,
-            "seed": self.options.seed,
-            "robot": self.finished.robot,
             "frames": taken,
             "dropped": dropped,
             "n_seen": len(self.record.seen),
             "refused": [{"id": i, "reason": t} for i, t in self.record.refused],
             "wait_ms": {"median": _ms(self.record.waits_s, 50), "p95": _ms(self.record.waits_s, 95)},
         }
-        if run.reason:
-            found["reason"] = run.reason
-        if e is not None:
-            c = e.clock
-            found |= {
-                "X_BC": e.X_BC.GetAsMatrix4().tolist(),
-                "covariance": e.covariance.tolist(),
-                "clock": c.kind,
-                "clock_offset_ms": None if c.offset_s is None else 1e3 * c.offset_s,
-                "clock_offset_sigma_ms": None if c.sigma_s is None else 1e3 * c.sigma_s,
-                "held_out_mm": statistics(1e3 * e.held_out_m[e.inliers]),
-                "rms_mm": 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2))),
-                "truth": self.truth(),
-            }
+        if self.report is not None:
+            said = self.report.summary()
+            found |= {key: said[key] for key in _SHARED} | {"held_out_mm": said["k_fold_mm"], "truth": self.truth()}
         return found | run.timing()
 
 
@@ -164,45 +147,26 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
     finished = run_job(scenario, options, progress, "motion")
     run, added = finished.run, finished.cell.job
     record, calibration = added.record(run.root), added.calibration(run.root)
-    outcome = MotionOutcome(options, finished, record, calibration.estimate)
     options.out.mkdir(parents=True, exist_ok=True)
     write_atomic(options.out / "scenario.yaml", scenario_text(scenario))
-    if calibration.estimate is not None:
-        result = calibration_result(outcome, calibration.estimate)
-        export_all(result, options.out)
-        save_result(result, options.out)
+    outcome = MotionOutcome(options, finished, record, None)
+    title, context = f"Calibration in motion, live, in “{options.scenario}”", robot_timing(run)
+    context["recording"] = finished.meshcat is not None
+    if (found := calibration.found) is not None:
+        result = replace(found.result, seed=options.seed)
+        known = vars(found) | {"result": result, "against": outcome.against, "no_tolerance": _NO_KEY}
+        outcome = replace(outcome, report=MotionReport(**known, seconds=run.wall_seconds, out=options.out))
+        save_all(result, options.out)
     if added.recorder is not None:
-        stream, scanner = posed_stream(record, finished.cell.station.arm), scenario.scanner_config()
-        assert scanner is not None
-        added.recorder.finish(stream, scenario.arm, scenario.flange_name(), scanner.scanner())
+        added.recorder.finish(posed_stream(record, finished.cell.station.arm), added.header)
     rows = [(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v]
-    page = page_html(
-        f"Calibration in motion, live, in “{options.scenario}”",
-        scenario.description,
-        [("Figures", [TableRows(rows, text=(0, 1))])],
-        first=outcome.first,
-        facts=[("scenario", "scenario.yaml beside this report")],
-        recording=finished.meshcat is not None,
-        **robot_timing(finished.run),
+    figures = ("Figures", [TableRows(rows, text=(0, 1))])
+    page = (
+        page_html(title, scenario.description, [figures], first=outcome.first, **context)
+        if outcome.report is None
+        else motion_report(outcome.report, title, figures, **context)
     )
     write_atomic(options.out / "report.html", page)
     write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
     finished.write_recording(options.out)
     return outcome
-
-
-def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> CalibrationResult:
-    """Return the estimate as a result folder holds it."""
-    scenario = outcome.run.cell.scenario
-    scanner = scenario.scanner_config()
-    return motion_result(
-        e,
-        [f.id for f, _ in outcome.record.seen],
-        outcome.record.refused,
-        warnings=e.warnings,
-        robot=scenario.arm,
-        flange=scenario.flange_name(),
-        scanner="" if scanner is None else scanner.scanner().name,
-        seed=outcome.options.seed,
-        data_hashes={},
-    )

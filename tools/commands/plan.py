@@ -12,17 +12,20 @@ from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import LEAST
 from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
-from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import ArmModel, mounted
+from weldcal.models.arms.shape import TUBE_M, arm_capsules
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic
+from weldcal.models.robots import get_chain
 from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.jobs.weld.settings import plan_poses as plan_scan_poses
+from weldcal.systems.motion.clear_moves import BareArm
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.parts import part_of
+from weldcal.systems.scenario.parts import part_of, surroundings_of
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.station import make_station
+from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import csv_text, write_json
 from weldcal.welding.passes.bead import WIDEST_M, bead_area, filling_passes
@@ -39,14 +42,23 @@ def plan_poses(
     ] = "calibrate_only",
     scans: Annotated[int, option("--scans", "N", "Number of scans.", min=12)] = 20,
     kind: Annotated[str, option("--kind", "KIND", "The refinement that they are for: links or joints.")] = "links",
+    robot: Annotated[
+        str | None, option("--robot", "NAME", "Another arm than the scenario's, for example my_arm.urdf.")
+    ] = None,
 ) -> Outcome:
     """Choose flange poses that the arm reaches and the scanner sees, and write them as a table and URScript. Nothing
     moves."""
 
     found = plan_refining_poses(
-        scenario, call.folder("plan-poses", scenario), scans=scans, kind=kind, seed=call.seed, progress=call.progress
+        scenario,
+        call.folder("plan-poses", scenario),
+        scans=scans,
+        kind=kind,
+        robot=robot,
+        seed=call.seed,
+        progress=call.progress,
     )
-    values = {k: found[k] for k in ("scans", "chosen_from", "written_to")}
+    values = {k: found[k] for k in ("scans", "chosen_from", "bodies", "written_to") if k in found}
     return Outcome(found, values={k.replace("_", " "): v for k, v in values.items()})
 
 
@@ -56,23 +68,25 @@ def plan_refining_poses(
     *,
     scans: int = 20,
     kind: str = "links",
+    robot: str | None = None,
     seed: int = 0,
     progress: Progress = lambda stage, fraction: None,
 ) -> dict[str, object]:
     """Choose ``scans`` poses before a scenario's scanner; write poses.csv, poses.script and plan.json to ``out``.
 
     ``poses.csv`` is the table of a dataset with the joint angles as planned; replace them by those that the robot
-    reports at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a
-    cell in which no such poses exist.
+    reports at each scan. ``robot`` is another arm than the scenario's, by name or URDF: then no script is written.
+    Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in which no such
+    poses exist.
     """
     if kind not in KINDS:
         raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")
     if scans < LEAST:
         raise InputError(f"Errors of the arm need {LEAST} scans and more, not {scans}.")
     loaded = load_scenario(scenario)
-    arm = load_chain(loaded.arm, None if loaded.kinematics is None else Path(loaded.kinematics))
     progress("poses", 0.0)
-    station = make_station(loaded, seed)
+    station = make_station(loaded, seed) if robot is None else _bare(loaded, robot)
+    arm = station.arm
     pool: tuple[PlannedPose, ...] = ()
     try:
         for k, times in enumerate(_POOL):
@@ -84,7 +98,8 @@ def plan_refining_poses(
                     raise
                 progress("poses", (k + 1) / (len(_POOL) + 1))
     finally:
-        station.close()
+        if isinstance(station, Station):
+            station.close()
     q = np.array([p.q for p in pool])
     chosen = [pool[i] for i in informative_poses(arm, loaded.calibration.mounting_guess.pose(), q, scans, kind)]
     rows = []
@@ -104,11 +119,21 @@ def plan_refining_poses(
         "turn_deg": turn_deg([p.X_BF for p in chosen]),
         "joints_deg": [[round(float(v), 3) for v in np.degrees(p.q)] for p in chosen],
     }
+    if arm.file is not None and all(c.radius == TUBE_M for c in arm_capsules(arm)):
+        result["bodies"] = f"{arm.name} has no shapes: its links are tubes of {2e3 * TUBE_M:.0f} mm between the joints."
     write_atomic(out / "poses.csv", csv_text(names, rows))
-    write_atomic(out / "poses.script", "\n".join(["# move to each pose and scan there", *moves]) + "\n")
+    if isinstance(arm, ArmModel):
+        write_atomic(out / "poses.script", "\n".join(["# move to each pose and scan there", *moves]) + "\n")
     write_json(out / "plan.json", result)
     progress("poses", 1.0)
     return result | {"written_to": str(out)}
+
+
+def _bare(scenario: Scenario, robot: str) -> BareArm:
+    """Return a known arm, or that of a URDF, on the scenario's base with its tool and surroundings."""
+    loaded = scenario.loaded_tool()
+    arm = mounted(get_chain(robot), scenario.base.pose())
+    return BareArm(arm, None if loaded is None else loaded.tool, surroundings_of(scenario))
 
 
 @command("plan-passes", short_help="Propose the passes that fill a joint.")

@@ -83,7 +83,7 @@ def _print_all(robots: list[Robot]) -> None:
     screen.print(table)
     screen.print(
         "-: not in a public source. dowel: degrees about the tool's z, from x. repeat: repeatability, plus or minus."
-        " inverse: how the inverse kinematics is solved.",
+        " inverse: all joint angles of a pose are found, or some.",
         highlight=False,
     )
     screen.print(
@@ -99,7 +99,7 @@ def _print_one(robot: Robot) -> None:
         "reach": f"{robot.reach_m:g} m",
         "repeatability": "" if robot.repeatability_m is None else f"± {1e3 * robot.repeatability_m:g} mm",
         "joint limits": f"{robot.joints} axes, below",
-        "kinematics": f"inverse: {robot.inverse}",
+        "kinematics": f"inverse: {robot.inverse} joint angles of a pose",
         "TCP": robot.tcp,
     }
     rows = {

@@ -7,7 +7,7 @@ import json
 import platform
 import time
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -17,7 +17,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import typer
 from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.writing import save_dataset
+from weldcal.models.arrays import Array
 from weldcal.models.documents import nearest
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
@@ -182,6 +186,30 @@ def run_job(
                 if recorder is not None:
                     recorder.close(run)
     return JobRun(run, meshcat, robot.title, live)
+
+
+def save_scans(
+    run: Run[Any], folder: Path, header: DatasetHeader, poses: Mapping[str, RigidTransform], joints: Mapping[str, Array]
+) -> Path | None:
+    """Write the scans of a live calibration as a dataset for `weldcal calibrate`; None where there are none.
+
+    ``poses`` are X_BF by the scan's label, ``joints`` (n,) rad likewise.
+    """
+    scanner, kept = run.cell.scenario.scanner_config(), run.scans
+    ids = [id for id in poses if id in kept]
+    if not ids or scanner is None:
+        return None
+    preset = scanner.scanner()
+    save_dataset(
+        folder,
+        header,
+        {id: poses[id] for id in ids},
+        {id: kept[id][0].points_C.astype(float) for id in ids},
+        times={id: kept[id][0].capture_time for id in ids},
+        joints=joints,
+        intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
+    )
+    return folder
 
 
 @contextmanager

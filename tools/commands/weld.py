@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import numpy as np
 import typer
 
-from weldcal.calibration.calibrate import KINEMATICS_FILE
-from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
-from weldcal.calibration.data.writing import save_dataset
+from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess, placed
+from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.eye_on_base.stated_error import estimate_result
 from weldcal.models.errors import InputError
 from weldcal.models.files import whole_result, write_apart
@@ -32,10 +29,10 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.cli.result_folder import writer
-from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
+from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options, save_scans
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import typed
-from weldcal.tools.report.render import write_atomic, write_json
+from weldcal.tools.report.render import save_all, write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.tools.report.weld_record import part_record, run_log, weld_record
@@ -287,7 +284,9 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        write_calibration(run.cell, result.status, result.options.seed, folder)
+        if (calibrated := live_result(run.cell, result.status, result.options.seed)) is not None:
+            refinement = result.status.refinement
+            save_all(calibrated, folder, "" if refinement is None else refinement.kinematics)
         write_scans(run, result.status, folder / SCANS, result.robot)
         if result.record is not None:
             if result.record.own is not None and (result.broken or result.record.run > 1):
@@ -313,38 +312,23 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
     estimate, refinement = status.estimate, status.refinement
     if estimate is None:
         return None
-    scanner, rows = cell.scenario.scanner_config(), zip(status.observations, estimate.inliers, strict=True)
-    outliers = [(o.id, "it disagrees with the other poses") for o, keep in rows if not keep]
+    scanner = cell.scenario.scanner_config()
     return estimate_result(
         estimate,
         status.observations,
-        [*outliers, *status.refused],
+        status.refused,
         cell.job.X_FR,
         [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep],
-        held_out_mm=live_errors(1e3 * estimate.held_out.position_m),
-        tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
+        local_field=None if status.local_field is None else status.local_field.document(),
+        kinematics="" if refinement is None else refinement.kinematics,
         warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
         robot=cell.scenario.arm,
         flange=cell.scenario.calibration.feature,
         scanner="" if scanner is None else scanner.scanner().name,
-        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
         scanner_correction=None if estimate.correction is None else estimate.correction.document(),
-        local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
         arm_errors=None if refinement is None else refinement.arm_errors,
-        kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
     )
-
-
-def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
-    """Write calibration.yaml and its exports for other tools, where there is a calibration."""
-    result = live_result(cell, status, seed)
-    if result is None:
-        return None
-    export_all(result, folder)
-    if status.refinement is not None and status.refinement.kinematics:
-        write_atomic(folder / KINEMATICS_FILE, status.refinement.kinematics)
-    return save_result(result, folder)
 
 
 def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
@@ -352,39 +336,20 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
 
     `robot` is the name of the robot, for the dataset's note.
     """
-    cell, scanner = run.cell, run.cell.scenario.scanner_config()
-    observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
-    if not observed or scanner is None:
-        return None
-    preset = scanner.scanner()
-    c, X_RF = cell.scenario.calibration, cell.job.X_FR.inverse()
-    guess = c.mounting_guess.pose()
+    X_FR, scenario, scanner = run.cell.job.X_FR, run.cell.scenario, run.cell.scenario.scanner_config()
+    c = scenario.calibration
     header = DatasetHeader(
-        robot=cell.scenario.arm,
-        flange=feature_standard(cell.scenario).designation,
-        scanner=preset.name,
+        robot=scenario.arm,
+        flange=feature_standard(scenario).designation,
+        scanner="" if scanner is None else scanner.scanner().name,
         configuration="eye_on_base",
         note=f"rendered scans of a run; robot: {robot}",
-        feature_in_flange=Feature(
-            _numbers(cell.job.X_FR.translation()), _numbers(cell.job.X_FR.rotation().ToQuaternion().wxyz())
-        ),
-        scanner_guess=ScannerGuess(
-            _numbers(guess.translation()), _numbers(guess.rotation().ToQuaternion().wxyz()), 1e-3 * c.guess_radius_mm
-        ),
+        feature_in_flange=Feature(**placed(X_FR)),
+        scanner_guess=ScannerGuess(**placed(c.mounting_guess.pose()), radius_m=1e-3 * c.guess_radius_mm),
     )
-    save_dataset(
-        folder,
-        header,
-        {id: X_BR @ X_RF for id, X_BR in observed.items()},
-        {id: run.scans[id][0].points_C.astype(float) for id in observed},
-        times={id: run.scans[id][0].capture_time for id in observed},
-        intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
-    )
-    return folder
-
-
-def _numbers(values: np.ndarray) -> list[float]:
-    return [float(v) for v in values]
+    poses = {o.id: o.X_BR @ X_FR.inverse() for o in status.observations}
+    joints = dict(zip(poses, status.joints, strict=False))
+    return save_scans(run, folder, header, poses, joints)
 
 
 def write_weld_log(record: WeldRecord, folder: Path) -> Path:

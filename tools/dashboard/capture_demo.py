@@ -1,4 +1,4 @@
-"""An emulated arm before an emulated scanner, for `weldcal capture --demo`: jogged by the page, scanned by ray casting."""
+"""An emulated arm before an emulated scanner, for `weldcal capture --demo`, jogged by the page."""
 
 from __future__ import annotations
 

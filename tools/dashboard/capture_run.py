@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.capture.session import ArmPose, Capture, Session, Verdict, ur_pose
+from weldcal.calibration.capture.session import ArmPose, Capture, CaptureSession, CaptureVerdict, ur_pose
 from weldcal.calibration.data.clouds import SUFFIXES, CloudError, read_cloud, save_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
@@ -50,7 +50,7 @@ class JoggedArm(Protocol):
     """An emulated arm that the page's buttons jog."""
 
     def jog(self, name: str, goal: RigidTransform | None) -> None:
-        """Move by a step along or about an axis of the base ("+x", "-rz"), or to a goal ("next"). Raises WeldcalError."""
+        """Move a step along or about an axis of the base ("+x", "-rz"), or to a goal ("next"). Raises WeldcalError."""
 
 
 class SensorError(WeldcalError):
@@ -138,11 +138,11 @@ def _written(datum: Any, folder: Path) -> Path:
 class CaptureRun:
     """The session, its sources, and what the page shows of them; the page's process asks from other threads."""
 
-    def __init__(self, session: Session, arm: ArmSource, sensor: Sensor, required_mm: float, title: str) -> None:
+    def __init__(self, session: CaptureSession, arm: ArmSource, sensor: Sensor, required_mm: float, title: str) -> None:
         self.session, self.arm, self.sensor, self.title = session, arm, sensor, title
         self.required_mm = required_mm
         self.files: dict[str, Path] = {}
-        self.verdict = Verdict(symbol=session.task.symbol, said=())
+        self.verdict = CaptureVerdict(symbol=session.task.symbol, said=())
         self.last: Capture | None = None
         self.state, self.problem, self.used = READY, "", False
         self.by_itself, self.checks = False, list[dict[str, Any]]()

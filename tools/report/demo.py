@@ -305,7 +305,7 @@ class DemoResult:
             found |= {
                 "n_used": int(estimate.inliers.sum()),
                 "covariance": estimate.covariance.tolist(),
-                "scanner_correction": None,
+                "scanner_correction": None if estimate.correction is None else estimate.correction.document(),
                 "tilt_deg": live_errors(np.degrees(estimate.held_out.tilt_rad)),
                 "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
                 "warnings": [*self.warnings, *estimate.warnings],

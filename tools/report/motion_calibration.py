@@ -1,27 +1,14 @@
 """Write the page of `calibrate` in motion: residuals against time, cost against the clock's offset."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import (
-    CalibrationResult,
-    export_ros2,
-    known,
-    matrix4,
-    pose_records,
-    software_version,
-    statistics,
-    target_document,
-    tilt_summary,
-)
+from weldcal.calibration.data.results import export_ros2, known, matrix4, target_document
 from weldcal.calibration.data.scanner_correction import DEVICE
-from weldcal.calibration.motion.estimate import MotionEstimate
-from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.models.arrays import Array
+from weldcal.calibration.recorded_motion import RecordedMotion
 from weldcal.tools.report.calibration import scanner_pose
 from weldcal.tools.report.first_screen import (
     NO_TOLERANCE,
@@ -35,48 +22,33 @@ from weldcal.tools.report.first_screen import (
     refused_note,
     typed,
 )
+from weldcal.tools.report.page import Bullets, FactList, Quantity, Section, Shot, TableRows, page_html
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
-from weldcal.tools.report.render import fixed, render, sigma_rows
+from weldcal.tools.report.render import fixed, sigma_rows
 
-
-def motion_result(
-    e: MotionEstimate, ids: Sequence[str], refused: Sequence[tuple[str, str]], **more: Any
-) -> CalibrationResult:
-    """The estimate as a result folder holds it; ``more``: the names of robot, flange and scanner, and other fields."""
-    values = {
-        "residual_mm": 1e3 * e.residual_m,
-        "held_out_mm": 1e3 * e.held_out_m,
-        "tilt_deg": np.degrees(e.tilt_rad),
-        "held_out_tilt_deg": np.degrees(e.held_out_tilt_rad),
-    }
-    return CalibrationResult(
-        X_BC=e.X_BC,
-        covariance=e.covariance,
-        held_out_mm=statistics(1e3 * e.held_out_m[e.inliers]),
-        tilt_deg=tilt_summary(e.held_out_tilt_rad[e.inliers]),
-        poses=pose_records(ids, e.inliers, values, refused),
-        unobservable=e.unobservable,
-        sigma_position_mm=1e3 * e.sigma_position_m,
-        sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
-        software=software_version(),
-        clock=e.clock,
-        clock_covariance=e.joint,
-        **more,
-    )
+COST = (
+    "Rms error of a rigid fit of all frames, if every frame was taken so much before its time. The dashed line marks"
+    " the start of the joint fit."
+)
+ALONG = (
+    "Distance along the motion between the flange seen and the flange by the robot. Above: frames taken at their"
+    " arrival, with the best pose for that. Below: frames taken when the clock says; what is left is the jitter of"
+    " single frames."
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MotionReport:
-    """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
+class MotionReport(RecordedMotion):
+    """The result of a calibration in motion, and its folder. ``limit_mm`` is the error that the job allows, or None.
 
-    result: CalibrationResult
-    estimate: MotionEstimate
-    frames: ObservedFrames
-    refused: tuple[tuple[str, str], ...]
-    outliers: tuple[str, ...]
+    Of a live run: what speaks ``against`` its result, and why no tolerance is known.
+    """
+
     seconds: float
     out: Path
     limit_mm: float | None = None
+    against: tuple[str, ...] = ()
+    no_tolerance: str = NO_TOLERANCE
 
     @property
     def first(self) -> FirstScreen:
@@ -84,7 +56,31 @@ class MotionReport:
 
         The error is the larger of two at 95 %: the pose's own in the middle of the frames, and the held-out one.
         """
-        return motion_screen(self.result, self.estimate, self.frames.p_C, self.refused, self.out, self.limit_mm)
+        r, p_C, used = self.result, self.frames.p_C, self.estimate.inliers
+        held = 1e3 * self.estimate.held_out_m[used]
+        held = held[np.isfinite(held)]
+        middle = np.asarray(p_C[used].mean(axis=0))
+        own = 1e3 * radius_95(point_covariance(r.X_BC, r.covariance, np.asarray(r.X_BC @ middle)))
+        p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
+        what = f"error {'in the middle of the frames' if r.symbol == 'X_BC' else 'at the target'}, 95 %"
+        expected, larger = expected_error(what, own, p95, len(held), "frames")
+        tolerance = limit_tolerance(what, larger, self.limit_mm)
+        found = Findings(
+            against=self.against,
+            tolerance=tolerance,
+            no_tolerance=self.no_tolerance,
+            unseen=len(held),
+            concerns=(*r.warnings, *r.unobservable),
+            notes=refused_note(self.refused, len(r.poses), "frames"),
+        )
+        if tolerance is not None and not tolerance.met:
+            after = Next("Record a longer motion, with more turns, or scans at rest.")
+        elif r.symbol == "X_BC":
+            watched = f"run '{typed('monitor --calibration', self.out)}' and name another recording of the flange"
+            after = Next(f"Verify with scans at rest that the calibration has not seen; or {watched}.", uses=True)
+        else:
+            after = Next("Record a second motion and calibrate again: the two poses should agree within their errors.")
+        return FirstScreen(found, expected, after, (scanner_pose(r),))
 
     @property
     def rms_mm(self) -> float:
@@ -148,57 +144,16 @@ def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else 1e3 * seconds
 
 
-def motion_screen(
-    r: CalibrationResult,
-    e: MotionEstimate,
-    p_C: Array,
-    refused: Sequence[tuple[str, str]],
-    out: Path,
-    limit_mm: float | None,
-    against: Sequence[str] = (),
-    no_tolerance: str = NO_TOLERANCE,
-) -> FirstScreen:
-    """Return the first screen of a calibration in motion; ``p_C`` (n, 3) m are the centres of all its frames."""
-    used, held = e.inliers, 1e3 * e.held_out_m[e.inliers]
-    held = held[np.isfinite(held)]
-    middle = np.asarray(p_C[used].mean(axis=0))
-    own = 1e3 * radius_95(point_covariance(r.X_BC, r.covariance, np.asarray(r.X_BC @ middle)))
-    p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
-    place = "in the middle of the frames" if r.symbol == "X_BC" else "at the target"
-    what = f"error {place}, 95 %"
-    expected, larger = expected_error(what, own, p95, len(held), "frames")
-    tolerance = limit_tolerance(what, larger, limit_mm)
-    notes = refused_note(refused, len(p_C) + len(refused), "frames")
-    concerns = (*r.warnings, *r.unobservable)
-    found = Findings(
-        against=against,
-        tolerance=tolerance,
-        no_tolerance=no_tolerance,
-        unseen=len(held),
-        concerns=concerns,
-        notes=notes,
-    )
-    if tolerance is not None and not tolerance.met:
-        after = Next("Record a longer motion, with more turns, or scans at rest.")
-    elif r.symbol == "X_BC":
-        watched = f"run '{typed('monitor --calibration', out)}' and name another recording of the flange"
-        after = Next(f"Verify with scans at rest that the calibration has not seen; or {watched}.", uses=True)
-    else:
-        after = Next("Record a second motion and calibrate again: the two poses should agree within their errors.")
-    return FirstScreen(found, expected, after, (scanner_pose(r),))
-
-
-def motion_report(report: MotionReport, *, dataset: str) -> str:
-    """Return the whole report as one self-contained HTML text."""
-    r, e = report.result, report.estimate
-    clock = e.clock
-    before, after = report.along_rms_mm
+def motion_report(report: MotionReport, title: str, *more: Section, **context: Any) -> str:
+    """Return the page; ``more`` sections and ``context`` of a live run, see page_html."""
+    r, e, clock = report.result, report.estimate, report.estimate.clock
+    n, device, (before, after) = len(report.refused), clock.kind == DEVICE, report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
         ("offset, ms", f"{_ms_text(clock.offset_s)} ± {_ms_text(clock.sigma_s)} (one sigma)"),
         ("jitter of single frames, ms", _ms_text(clock.jitter_s)),
     ]
-    if clock.kind == DEVICE and clock.drift is not None and clock.drift_sigma is not None:
+    if device and clock.drift is not None and clock.drift_sigma is not None:
         facts += [
             ("drift, ppm", f"{fixed(1e6 * clock.drift, 1)} ± {fixed(1e6 * clock.drift_sigma, 1)}"),
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
@@ -207,27 +162,37 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
         facts.append(
             ("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}")
         )
-    return render(
-        "motion_calibration.html.j2",
-        dataset=dataset,
-        r=r,
-        clock=clock,
-        device=clock.kind == DEVICE,
-        n_used=int(e.inliers.sum()),
-        n_total=len(report.frames) + len(report.refused),
-        rms_mm=report.rms_mm,
-        before_mm=before,
-        after_mm=after,
-        offset_ms=None if clock.offset_s is None else 1e3 * clock.offset_s,
-        offset_sigma_ms=None if clock.sigma_s is None else 1e3 * clock.sigma_s,
+    base = "device times" if device else "arrivals"
+    off = Quantity("Clock offset", _ms(clock.offset_s), "ms", f"± {_ms_text(clock.sigma_s)} (one sigma), {base}")
+    where = "fixed beside the arm" if r.symbol == "X_BC" else "on the arm, which sees a fixed target"
+    cell = ", ".join(filter(None, (r.robot, r.scanner, r.flange and f"flange {r.flange}")))
+    pose = FactList([*sigma_rows(r.covariance), ("ROS 2", export_ros2(r.X_BC).strip())])
+    formula = f"Capture time = {'device time + offset (+ drift)' if device else 'arrival - offset'}."
+    return page_html(
+        title,
+        f"{cell}; scanner {where}, frames taken while it moves",
+        (
+            ("Warnings", [Bullets(r.warnings), Bullets(r.unobservable, "not observable: ")]),
+            ("Uncertainty of the pose", [pose]),
+            ("Clock", [formula, FactList(facts), Shot(_cost(report), COST, "Curve of cost against offset")]),
+            ("Residual along the motion", [Shot(_along(report), ALONG, "Two plots of the residual against time")]),
+            (
+                "Frames not used",
+                [TableRows(report.refused, ("frame", "reason"), (0, 1), f"{n} frames, with the reason")],
+            ),
+            *more,
+        ),
         first=report.first,
-        pose_facts=[*sigma_rows(r.covariance), ("ROS 2", export_ros2(r.X_BC).strip())],
-        clock_facts=facts,
-        along=_along(report),
-        cost=_cost(report),
-        refused=report.refused[:200],
-        n_refused=len(report.refused),
-        seconds=report.seconds,
+        cards=(
+            off,
+            Quantity(
+                "Residual along the motion", after, "mm", f"rms; {fixed(before, 2)} without synchronisation", digits=2
+            ),
+            Quantity("Residual, rms", report.rms_mm, "mm", "at the most probable capture times"),
+            Quantity("Frames used", f"{int(e.inliers.sum())} of {len(r.poses)}", "", f"{n or 'none'} refused"),
+        ),
+        facts=[("time", f"{fixed(report.seconds, 1)} s")],
+        **context,
     )
 
 

@@ -26,11 +26,11 @@ from weldcal.calibration.hand_eye.solve import pose_difference
 from weldcal.calibration.planning.mounting_estimate import MountingResult
 from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE, FOOT, MountingScene
+from weldcal.calibration.recorded_carried import CarriedCalibration
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.jobs.mounting.job import AddedMounting
-from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
     ExpectedError,
@@ -65,54 +65,43 @@ class TruthError:
     bound: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MountingReport:
-    """The result of a calibration, and its folder; ``run`` is None where the scans were recorded."""
+    """The result of a calibration, and its folder.
 
-    run: Run[AddedMounting] | None
-    result: MountingResult | None
+    Attributes:
+        scene: as known before the first scan.
+        limit: the error (mm, 95 %) that is allowed, and where that is stated.
+        description: one sentence on the cell, or on the dataset.
+        source: name of the file that states what was done, and its text.
+        run: None where the scans were recorded.
+    """
+
+    scene: MountingScene
+    status: CarriedCalibration
     folder: Path
     seconds: float
-    robot: str = "simulated"
+    limit: tuple[float | None, str]
+    description: str
+    source: tuple[str, str]
+    robot: str = "recorded"
+    run: Run[AddedMounting] | None = None
 
     @property
-    def job(self) -> AddedMounting:
-        """The job that ran."""
-        assert self.run is not None
-        return self.run.cell.job
-
-    @property
-    def scene(self) -> MountingScene:
-        """The scene as known before the first scan."""
-        return self.job.scene
+    def result(self) -> MountingResult | None:
+        """The poses with their held-out errors."""
+        return self.status.result
 
     @property
     def truth(self) -> Mapping[str, RigidTransform]:
         """The true poses by their letters; empty where they are not known."""
-        return {} if self.run is None else self.job.truth
+        return {} if self.run is None else self.run.cell.job.truth
 
     @property
     def device(self) -> ScannerPreset | None:
         """The simulated scanner with its own errors; None where it is not known."""
         true = None if self.run is None else self.run.cell.station.truth.scanner
         return None if true is None else true.device
-
-    @property
-    def status(self) -> MountingStatus:
-        """The calibration's last status."""
-        assert self.run is not None
-        return self.job.status(self.run.root)
-
-    @property
-    def tolerance(self) -> tuple[float | None, str]:
-        """The error (mm, 95 %) that the job allows, and where that is stated."""
-        assert self.run is not None
-        return self.run.cell.scenario.calibration.required_error_mm, "calibration.required_error_mm"
-
-    @property
-    def description(self) -> str:
-        """One sentence on the cell."""
-        return "" if self.run is None else self.run.cell.scenario.description
 
     @property
     def mounting(self) -> Mounting:
@@ -148,7 +137,7 @@ class MountingReport:
         if aside:
             more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
             expected = ExpectedError(what, expected.figure, more)
-        limit, source = self.tolerance
+        limit, source = self.limit
         tolerance = None if limit is None else Tolerance("the expected error, 95 %,", figure, limit, source)
         open_directions = undetermined(result)
         against += open_directions
@@ -156,7 +145,7 @@ class MountingReport:
             *(f"Not observable: {text}" for text in result.unobservable if not open_directions),
             *result.warnings,
         ]
-        notes = [self.scanner_sentence(), *refused_note(status.refused, status.sequence)]
+        notes = [self.scanner_sentence(), *refused_note(status.refused, status.scans)]
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         after = Next("Use the pose; calibrate again after the scanner was moved.", uses=True)
         if status.next_best is not None:
@@ -210,7 +199,7 @@ class MountingReport:
         if self.reason:
             out["reason"] = self.reason
         out |= {
-            "n_scans": status.sequence,
+            "n_scans": status.scans,
             "n_used": len(status.seen),
             "refused": [{"id": id, "reason": why} for id, why in status.refused],
         }
@@ -286,38 +275,6 @@ class MountingReport:
         return "\n".join(lines)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RecordedMounting(MountingReport):
-    """The result of recorded scans; ``limit_mm``: the error allowed, ``digest``: of the files of dataset ``source``."""
-
-    recorded: MountingStatus
-    place: MountingScene
-    folder: Path = Path()
-    source: str = ""
-    digest: str = ""
-    limit_mm: float | None = None
-
-    @property
-    def scene(self) -> MountingScene:
-        """See MountingReport."""
-        return self.place
-
-    @property
-    def status(self) -> MountingStatus:
-        """See MountingReport."""
-        return self.recorded
-
-    @property
-    def tolerance(self) -> tuple[float | None, str]:
-        """See MountingReport."""
-        return self.limit_mm, "--limit-mm"
-
-    @property
-    def description(self) -> str:
-        """See MountingReport."""
-        return f"Recorded scans: {self.source}."
-
-
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     """Return the whole report as one self-contained HTML text."""
     status, mounting, result = report.status, report.mounting, report.result
@@ -357,7 +314,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         work_mm=report.work_error_mm(),
         distance_mm=1e3 * report.scene.scanner.optimum_m,
         n_used=len(status.seen),
-        n_scans=status.sequence,
+        n_scans=status.scans,
         unobservable=() if result is None else result.unobservable,
         warnings=() if result is None else result.warnings,
         refused=status.refused,
@@ -377,7 +334,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
 def _growth(report: MountingReport) -> bytes:
     """Expected error of a point at the work distance after every scan."""
     n, sigma = np.array(report.status.history).T
-    required = report.tolerance[0]
+    required = report.limit[0]
     figure, axes = subplots(8.2, 2.8)
     axes.plot(n, 1e3 * sigma, "o-", color=OURS, markersize=5)
     if required is not None:
@@ -403,7 +360,7 @@ def station_picture(report: MountingReport) -> bytes | None:
     run = report.run
     if run is None or (world := run.cell.station.world) is None:
         return None
-    pose = report.status.seen[-1].pose if report.status.seen else report.job.plan[0]
+    pose = report.status.seen[-1].pose if report.status.seen else run.cell.job.plan[0]
     frames = true_frames(report, pose.q, pose.q_2)
     root = run.root.Clone()
     plant_context = world.plant.GetMyMutableContextFromRoot(root)

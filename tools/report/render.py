@@ -14,7 +14,13 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
 from markupsafe import Markup, escape
 
-from weldcal.calibration.data.results import software_version
+from weldcal.calibration.data.results import (
+    KINEMATICS_FILE,
+    CalibrationResult,
+    export_all,
+    save_result,
+    software_version,
+)
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import write_atomic as write_atomic
@@ -186,6 +192,14 @@ def _coloured(found: re.Match[str]) -> str:
     if colour in ("#e3e6e9", "#b0b0b0", "#cccccc"):
         return "var(--line)"
     return f"var(--plot-{_PLOT[colour]})" if colour in _PLOT else found[0]
+
+
+def save_all(result: CalibrationResult, folder: Path, kinematics: str = "") -> None:
+    """Write the exports, the text of refined ``kinematics``, and last calibration.yaml: then everything is there."""
+    export_all(result, folder)
+    if kinematics:
+        write_atomic(folder / KINEMATICS_FILE, kinematics)
+    save_result(result, folder)
 
 
 def write_json(path: Path, content: object) -> None:

@@ -31,7 +31,7 @@ class WeldPass:
     Attributes:
         lateral_m, vertical_m: of its torch's path from that of the root, to the left of the root's travel and along the
             joint's bisector out of it.
-        travel_angle_rad: lean along its own travel, push positive; None: as the lift of the tip gives it.
+        travel_rad: lean along its own travel, push positive; None: as the lift of the tip gives it.
         angle_rad: lean of the tool across the seam; positive: its left side, in the root's travel, is higher.
         speed_m_s: None: as the root. reverse: it is welded from the end to the start.
         interpass_s: least time since the arc of the pass before went out.
@@ -41,7 +41,7 @@ class WeldPass:
     vertical_m: float = 0.0
     angle_rad: float = 0.0
     speed_m_s: float | None = None
-    travel_angle_rad: float | None = None
+    travel_rad: float | None = None
     reverse: bool = False
     interpass_s: float = 0.0
 
@@ -127,9 +127,9 @@ def pass_config(root: ServoConfig, order: WeldPass, ball_m: float) -> ServoConfi
     """Settings of a pass after the root: the tip is not used, and hangs above the path of the torch."""
     tool = replace(root.tool, torch_clearance_m=root.clearance_m - lift_m(root, ball_m), side_offset_m=0.0)
     angles = None
-    if order.travel_angle_rad is not None:
+    if order.travel_rad is not None:
         half_rad = 0.5 * math.pi if root.angles is None else root.angles.half_angle_rad
-        work, travel = order.lean_rad, order.travel_angle_rad
+        work, travel = order.lean_rad, order.travel_rad
         angles = TorchAngles(work_rad=(work, work), travel_rad=(travel, travel), half_angle_rad=half_rad)
     return replace(
         root,

@@ -9,7 +9,8 @@ import numpy as np
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.readings import PoseNumbers, PoseReading, parse_form, readings
 from weldcal.calibration.errors import DatasetError
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import chain_poses
 from weldcal.models.arrays import Array
 from weldcal.models.files import LARGEST_NUMBER, MOST_POSES
 

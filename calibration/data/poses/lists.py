@@ -1,38 +1,23 @@
 """Read every list of poses of a file or folder, whatever its form, and find the robot's and the camera's among them."""
 
-import gzip
 import re
-import zipfile
-import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
-from weldcal.calibration.data.poses.names import ENDINGS, TREES, last_key, natural, number_of, whose
-from weldcal.calibration.data.poses.storage import matlab_arrays, read_tree, tree_of_text
-from weldcal.calibration.data.poses.text import keyed_lists, lists_of_text
-from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
+from weldcal.calibration.data.poses.formats import may_hold_poses, read_recording
+from weldcal.calibration.data.poses.listing import Listing, require_pose
+from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
+from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.errors import DatasetError
-from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 _OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
 _CLOUDS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd")
-PICKLED = (
-    "'{}' holds Python objects (a pickle), which may run code: save the two arrays with numpy.savez(file, robot=...,"
-    " camera=...)."
-)
+_NOT_ONE = "'{}' does not hold one pose, as the {} files beside it do; give one pose a file."
 _COPIED = 1e-3  # a choice: copies with three decimals or more
-_BEGINNING = 4000  # characters that show what a text is
-_TREE_TEXT = re.compile(
-    r"(?m)^\s*(position|translation|orientation|rotation|pose|transforms?):[ \t\r]*$|\A\s*\[?\s*\{\s*\""
-)
-_TABLE_TEXT = re.compile(r"(?m)^At time|Translation: \[")
 _INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target|board|marker|object|chess\w*)")
 
 
@@ -51,32 +36,20 @@ def lists_of_file(path: Path) -> list[Listing]:
     Raises:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
     """
-    try:
-        file_size(path)
-        ending = path.suffix.lower()
-        if ending == ".npz":
-            return lists_of_tree(dict(read_npz(path)), path.name)
-        if ending == ".npy":
-            return [listing_of_array(path.name, _numbers(path, _array(path)))]
-        if ending == ".mat" and not _is_text(path):
-            return lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name)
-        if ending == ".xlsx":
-            return _workbook(path)
-        if ending in TREES:
-            lines = keyed_lists(read_text(path), path.name) if ending == ".xml" else []
-            return lines or lists_of_tree(read_tree(path), path.name)
-        if ending == ".urp":
-            return lists_of_text(_unzipped(path), path.name)
-        require_few_lines(path)
-        text = read_text(path)
-        if _TREE_TEXT.search(text[:_BEGINNING]) and not _TABLE_TEXT.search(text[:_BEGINNING]):
-            kind = "JSON" if text.lstrip().startswith(("{", "[")) else "YAML"
-            return lists_of_tree(tree_of_text(text, path.name, kind), path.name)
-        return lists_of_text(text, path.name)
-    except DatasetError:
-        raise
-    except InputError as problem:
-        raise DatasetError(str(problem)) from problem
+    return read_recording(path).lists
+
+
+def pose_a_file(files: Sequence[Path], name: str) -> Listing:
+    """Return the list of files that hold one pose each, its rows named after the files.
+
+    Raises:
+        DatasetError: a file cannot be read, or holds no pose or several.
+    """
+    lists = [lists_of_file(path) for path in files]
+    for path, found in zip(files, lists, strict=True):
+        if len(found) != 1 or len(found[0]) != 1:
+            raise DatasetError(_NOT_ONE.format(path.name, len(files) - 1))
+    return stacked([one for (one,) in lists], name, tuple(p.stem for p in files))
 
 
 def folder_lists(folder: Path, needed: int = 2, skip: frozenset[Path] = frozenset()) -> list[Listing]:
@@ -135,7 +108,7 @@ def _may_hold_poses(path: Path) -> bool:
 
     Raises DatasetError where another thing than a file or a folder has such a name.
     """
-    named = path.suffix.lower() in ENDINGS and path.name.lower() not in _OWN and not path.name.startswith((".", "_"))
+    named = may_hold_poses(path) and path.name.lower() not in _OWN and not path.name.startswith((".", "_"))
     if named and not path.is_file() and (not path.is_dir() or _one_of_files(path)):
         raise DatasetError(f"'{path.name}' is no file that can be read; replace it by a file, or remove it.")
     return named and path.is_file()
@@ -166,20 +139,14 @@ def _group(files: list[Path], label: str) -> list[Listing]:
             return [
                 stacked(
                     [lists[k][j] for k in order],
-                    f"{prefix}{files[0].name} ..., {_key_of(lists[0][j])}",
+                    f"{prefix}{files[0].name} ..., {lists[0][j].name.rpartition(', ')[2]}",
                     tuple(ids[k] for k in order),
                 )
                 for j in range(each)
             ]
-        raise DatasetError(
-            f"'{many.name}' does not hold one pose, as the {len(files) - 1} files beside it do; give one pose a file."
-        )
+        raise DatasetError(_NOT_ONE.format(many.name, len(files) - 1))
     name = f"{prefix}{files[0].name}" if alike else f"{prefix}{files[0].name} ... {files[-1].name}"
     return [stacked([lists[k][0] for k in order], name, tuple(ids[k] for k in order))]
-
-
-def _key_of(listing: Listing) -> str:
-    return listing.name.rpartition(", ")[2]
 
 
 def _renamed(listing: Listing, prefix: str) -> Listing:
@@ -309,66 +276,3 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
             f"No pose of '{robot.name}' is within {near_s:g} s of a pose of '{camera.name}'; bring both to one clock."
         )
     return nearest[keep], np.flatnonzero(keep), "by time"
-
-
-def _unzipped(path: Path) -> str:
-    """Return the text of a robot program that is stored compressed."""
-    try:
-        with gzip.open(path) as stream:
-            found = stream.read(LARGEST_DOCUMENT + 1)
-    except gzip.BadGzipFile:
-        return read_text(path)
-    except (OSError, EOFError, zlib.error) as problem:
-        raise DatasetError(f"'{path.name}' is damaged: its compressed text does not end.") from problem
-    if len(found) > LARGEST_DOCUMENT:
-        raise DatasetError(f"'{path.name}' holds more than {LARGEST_DOCUMENT // 2**20} MiB of text.")
-    return found.decode("utf-8", "replace")
-
-
-def _array(path: Path) -> Any:
-    try:
-        return read_npy(path)
-    except InputError as problem:
-        if "holds object" not in str(problem):
-            raise
-        raise DatasetError(PICKLED.format(path.name)) from problem
-
-
-def _numbers(path: Path, value: Any) -> Any:
-    if value.dtype.kind not in "fiu":
-        raise DatasetError(f"'{path.name}' holds words, not numbers.")
-    return value.astype(float)
-
-
-def _is_text(path: Path) -> bool:
-    """Return whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
-    with path.open("rb") as stream:
-        return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
-
-
-def _workbook(path: Path) -> list[Listing]:
-    try:
-        from openpyxl import load_workbook
-    except ImportError as problem:
-        raise DatasetError(
-            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install"
-            " openpyxl)."
-        ) from problem
-    try:
-        book = load_workbook(path, read_only=True, data_only=True)
-        sheets = {
-            sheet.title: "\n".join(
-                ";".join("" if cell is None else str(cell) for cell in row)
-                for row in sheet.iter_rows(max_row=MOST_CELLS, values_only=True)
-            )
-            for sheet in book.worksheets
-        }
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as problem:
-        raise DatasetError(
-            f"'{path.name}' cannot be read as an Excel file ({type(problem).__name__}); save it as CSV."
-        ) from problem
-    found = []
-    for title, text in sheets.items():
-        if text.strip():
-            found += lists_of_text(text, f"{path.name}, {title}" if len(sheets) > 1 else path.name)
-    return found

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 
 TEXT = (
     ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc",
-    ".urp", ".sys", ".jbi",
+    ".sys", ".jbi",
     ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out", ".tfm", ".g2o",
 )  # fmt: skip
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
-ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
-ENDINGS = (*TEXT, *TREES, *ARRAYS)
-"""Endings of files that may hold poses."""
 
 MOUNTINGS = {
     "eye_on_base": ("eye_to_hand", "eye_on_base", "eye_off_hand", "fixed", "static", "stationary"),

@@ -1,13 +1,17 @@
 """Find poses in robot programs, pose files and what ROS prints, by the words that only these have."""
 
+import gzip
 import re
+import zlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of
 from weldcal.calibration.errors import DatasetError
+from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
 NUMBER = r"[-+]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][-+]?\d{1,5})?"
 """A number; bounded, so that a search in a long row of digits ends."""
@@ -202,6 +206,20 @@ def _g2o(text: str, name: str) -> Listing | None:
     found = _G2O.findall(text)
     rows = [_floats(m[1]) for m in found]
     return _listed(name, rows, "g2o vertices", "m", "quaternion_xyzw", [m[0] for m in found])
+
+
+def unzipped(path: Path) -> str:
+    """Return the text of a robot program that is stored compressed, or plain. Raises InputError."""
+    try:
+        with gzip.open(path) as stream:
+            found = stream.read(LARGEST_DOCUMENT + 1)
+    except gzip.BadGzipFile:
+        return read_text(path)
+    except (OSError, EOFError, zlib.error) as problem:
+        raise DatasetError(f"'{path.name}' is damaged: its compressed text does not end.") from problem
+    if len(found) > LARGEST_DOCUMENT:
+        raise DatasetError(f"'{path.name}' holds more than {LARGEST_DOCUMENT // 2**20} MiB of text.")
+    return found.decode("utf-8", "replace")
 
 
 def list_of_program(text: str, name: str) -> Listing | None:

@@ -92,19 +92,28 @@ class PoseReading:
     doubted: bool = False
 
     def changed(self, change: str) -> "PoseReading":
-        """Return the reading with one of CHANGES applied."""
+        """Return the reading with one of CHANGES applied; one that was applied last is taken back."""
         words = {
             "transposed": "rotations transposed",
             "left_handed": "in a left-handed frame (y mirrored)",
             "inverse": "inverted",
         }[change]
-        X = apply_change(self.X, change)
-        return replace(self, form=f"{self.form},{change}", words=f"{self.words}, {words}", X=X)
+        X, last = apply_change(self.X, change), f",{change}"
+        if self.form.endswith(last):
+            return replace(self, form=self.form.removesuffix(last), words=self.words.removesuffix(f", {words}"), X=X)
+        return replace(self, form=self.form + last, words=f"{self.words}, {words}", X=X)
 
 
 def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[PoseReading]:
     """Return the readings of some rows."""
     return [replace(one, X=one.X[rows]) for one in listed]
+
+
+def change_of(one: PoseReading, listed: Sequence[PoseReading]) -> str | None:
+    """Return the change by which a reading differs from those that are stated; None: it is one of them."""
+    if any(one.form == other.form for other in listed):
+        return None
+    return next(by for by in CHANGES if any(other.changed(by).form == one.form for other in listed))
 
 
 def apply_change(X: Array, change: str) -> Array:
@@ -204,13 +213,13 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     largest = float(np.abs(numbers.r).max(initial=0.0))
     if numbers.angles == "rad" and largest > _TURN_RAD:
         raise DatasetError(
-            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians. State degrees"
-            " by 'poses: {angles: deg}' in dataset.yaml, for hand-eye by --as robot-form=deg or --as camera-form=deg."
+            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a turn in rad: they seem to be degrees."
+            " State them by 'poses: {angles: deg}' in dataset.yaml, or by --as robot-form=deg or --as camera-form=deg."
         )
     if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:
         raise DatasetError(
             f"No angle of '{numbers.source}' exceeds {largest:.2f}, as degrees: they look like radians. State rad"
-            " by 'poses: {angles: rad}' in dataset.yaml, for hand-eye by --as robot-form=rad or --as camera-form=rad."
+            " by 'poses: {angles: rad}' in dataset.yaml, or by --as robot-form=rad or --as camera-form=rad."
         )
     units = [numbers.angles] if numbers.angles else ["deg"] if largest > _TURN_RAD else ["rad", "deg"]
     if not numbers.angles and largest <= _LEAST_DEG:

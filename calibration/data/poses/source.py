@@ -11,16 +11,8 @@ from weldcal.calibration.data.checks import JOINT_NAME, read_rows
 from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.names import (
-    BASES,
-    ENDINGS,
-    FLANGES,
-    columns_of,
-    joint_columns,
-    natural,
-    number_of,
-    whose,
-)
+from weldcal.calibration.data.poses.formats import may_hold_poses
+from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, joint_columns, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
@@ -185,17 +177,17 @@ def find_poses(folder: Path) -> Path | tuple[Path, ...] | None:
     Known are poses.* and the like, a folder poses/, and files such as pos01.yaml beside the clouds.
     """
     for stem in _STEMS:
-        for path in _files(folder):
+        for path in files_of_poses(folder):
             if path.stem.lower() == stem:
                 return path
     for name in _FOLDERS:
-        inside = _files(folder / name) if (folder / name).is_dir() else []
+        inside = files_of_poses(folder / name) if (folder / name).is_dir() else []
         if inside:
             return tuple(inside) if len(inside) > 1 else inside[0]
-    for path in _files(folder):
+    for path in files_of_poses(folder):
         if "pose" in path.stem.lower() and number_of(path.stem) is None:
             return path
-    each = [p for p in _files(folder) if p.stem.lower().startswith(_ONE) and number_of(p.stem) is not None]
+    each = [p for p in files_of_poses(folder) if p.stem.lower().startswith(_ONE) and number_of(p.stem) is not None]
     kinds = {p.suffix.lower() for p in each}
     if len(each) > 1 and len(kinds) == 1:
         return tuple(each)
@@ -220,16 +212,12 @@ def is_plain(path: Path) -> bool:
     return "id" in names and roles <= own and not any(c.unit for c in columns) and not any("." in n for n in names)
 
 
-def files_of_poses(folder: Path) -> tuple[Path, ...]:
+def files_of_poses(folder: Path) -> list[Path]:
     """Return the files of a folder that may hold poses, in the natural order of their names."""
-    return tuple(_files(folder))
-
-
-def _files(folder: Path) -> list[Path]:
     found = [
         p
         for p in folder.iterdir()
-        if p.suffix.lower() in ENDINGS and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
+        if may_hold_poses(p) and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
     ]
     return sorted(found, key=lambda p: natural(p.name))
 
@@ -239,19 +227,10 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm, arm: str = "") -
 
     Raises DatasetError, one sentence that says what to change.
     """
-    from weldcal.calibration.data.poses.lists import lists_of_file, read_lists  # poses.csv needs none of these readers
-    from weldcal.calibration.data.poses.trees import stacked
+    from weldcal.calibration.data.poses.lists import pose_a_file, read_lists  # poses.csv needs none of these readers
 
     if isinstance(source, tuple):
-        lists = [lists_of_file(path) for path in source]
-        many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
-        if many is not None:
-            raise DatasetError(
-                f"'{many.name}' holds more than one pose, and there are {len(source)} such files; give one or the"
-                " other."
-            )
-        name = f"{source[0].name} ... {source[-1].name}"
-        found = stacked([one[0] for one in lists], name, tuple(p.stem for p in source))
+        found = pose_a_file(source, f"{source[0].name} ... {source[-1].name}")
         found = replace(found, form=f"one file per pose, {found.form}")
     else:
         found = robot_list(read_lists(source), source.name, form)
@@ -281,7 +260,10 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
     """
     if len(lists) == 1:
         return lists[0]
-    frames = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists if " to " in one.name}
+    if not lists:
+        raise DatasetError(f"'{name}' holds no poses. Give a row for each pose, such as x_mm,y_mm,z_mm,qw,qx,qy,qz.")
+    labels = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists}
+    frames = {pair: one for pair, one in labels.items() if len(pair) == 2}
     if frames:
         flanges = [form.flange_frame] if form.flange_frame else list(FLANGES)
         bases = (
@@ -298,11 +280,18 @@ def robot_list(lists: "list[Listing]", name: str, form: PoseForm) -> "Listing":
             f"'{name}' holds the transforms {pairs}, none from the base to the flange; set poses.base_frame and"
             " poses.flange_frame in dataset.yaml, or record the pose topic of the driver."
         )
-    mine = [one for one in lists if whose(one.name) == "robot"]
+    from weldcal.calibration.data.poses.lists import without_copies  # as in read_poses
+
+    mine = without_copies([one for one in lists if whose(one.name) == "robot"])
     if len(mine) == 1:
         return mine[0]
     known = ", ".join(repr(one.name) for one in lists[:6])
     raise DatasetError(f"'{name}' holds several lists of poses: {known}. Keep the one of the flange in the base.")
+
+
+def unit_by_size(p: Array) -> str:
+    """Return the unit of the positions (n, 3) of an arm's flange or of a board by their median distance: m or mm."""
+    return "mm" if float(np.median(np.linalg.norm(p, axis=1))) > _MILLIMETRES else "m"
 
 
 def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str]:
@@ -326,7 +315,7 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
         form = PoseForm()
     X = inverse(found.X) if form.frame == "base_in_flange" else found.X.copy()
     if unit == "auto":
-        unit = found.unit or ("mm" if float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) > _MILLIMETRES else "m")
+        unit = found.unit or unit_by_size(X[:, :3, 3])
     X[:, :3, 3] *= {"m": 1.0, "mm": 1e-3}[unit]
     if form.tcp:
         tcp = np.asarray(form.tcp, dtype=float)

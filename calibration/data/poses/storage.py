@@ -58,8 +58,8 @@ def tree_of_text(text: str, name: str, kind: str = "YAML") -> Any:
     return [_matrices(parse_document(name, one, kind)) for one in documents]
 
 
-def _array(value: Any) -> Array | None:
-    """Nested lists of numbers as an array; None where they are none."""
+def array_of(value: Any) -> Array | None:
+    """Return nested lists of numbers as an array; None where they are none."""
     try:
         return np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -74,7 +74,7 @@ def _matrices(tree: Any) -> Any:
         return tree
     if {"rows", "cols", "data"} <= set(tree):
         rows, cols = as_number(tree["rows"]), as_number(tree["cols"])
-        data = _array(tree["data"])
+        data = array_of(tree["data"])
         channels = re.match(r"\d+", str(tree.get("dt", "")))
         depth = int(channels[0]) if channels else 1
         if data is None or not (rows > 0 and cols > 0) or data.size != rows * cols * depth:

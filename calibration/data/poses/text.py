@@ -4,11 +4,12 @@ Tables with or without a header, blocks of numbers, robot programs and what ROS 
 """
 
 import re
+import zipfile
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,13 @@ from weldcal.calibration.data.poses.names import PoseColumn, columns_of, distinc
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
-from weldcal.models.files import require_short_numbers
+from weldcal.models.files import MOST_CELLS, require_short_numbers
+from weldcal.models.text_tables import cells_of, lines_of, separator_of
 
 _CELL = re.compile(rf"{NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _KEYED = re.compile(rf"[\"']?\b([A-Za-z_][\w.]{{0,40}})[\"']?\s{{0,9}}[:=]\s{{0,9}}[\"']?({NUMBER})(?![\w.])")
 _UNIT_CELL = re.compile(r"(?i)[\[(]?(mm|cm|m|in|inch|deg|rad|degrees?|radians?|°|-|s|ms)?[\])]?")
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+_BRACKETS = re.compile(r"[\[\](){}]")
 _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
@@ -56,6 +58,31 @@ _ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 """The columns of a rotation, and what they say of it, in the order in which they are sought."""
 
 
+def sheets_of(path: Path) -> dict[str, str]:
+    """Return the sheets of an Excel file that hold anything, as text with semicolons. Raises DatasetError."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError as problem:
+        raise DatasetError(
+            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install"
+            " openpyxl)."
+        ) from problem
+    try:
+        book = load_workbook(path, read_only=True, data_only=True)
+        sheets = {
+            sheet.title: "\n".join(
+                ";".join("" if cell is None else str(cell) for cell in row)
+                for row in sheet.iter_rows(max_row=MOST_CELLS, values_only=True)
+            )
+            for sheet in book.worksheets
+        }
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as problem:
+        raise DatasetError(
+            f"'{path.name}' cannot be read as an Excel file ({type(problem).__name__}); save it as CSV."
+        ) from problem
+    return {title: text for title, text in sheets.items() if text.strip()}
+
+
 def lists_of_text(text: str, name: str) -> list[Listing]:
     """Return every list of poses of a text.
 
@@ -85,7 +112,7 @@ def keyed_lists(text: str, name: str) -> list[Listing]:
 
     Empty where it has none.
     """
-    rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
+    rows = [found for _, line in lines_of(text) if len(found := _KEYED.findall(line)) >= 6]
     names = [key for key, _ in rows[0]] if len(rows) > 1 else []
     if not names or any([key for key, _ in row] != names for row in rows) or _named(names) < 5:
         return []
@@ -254,45 +281,21 @@ def _quaternion_rows(table: Array) -> bool:
 
 def _lines(text: str) -> tuple[list[_Line], list[_Line]]:
     """Return the lines of a table in cells, and its comments."""
-    plain = re.split(r"\r\n|\n|\r", text)
-    rows = [(k, s) for k, s in enumerate(plain, 1) if s.strip() and not s.lstrip().startswith(_COMMENT)]
-    comments = [
-        (k, s.lstrip().lstrip("#%/!;").strip()) for k, s in enumerate(plain, 1) if s.lstrip().startswith(_COMMENT)
-    ]
-    separator = _separator([s for _, s in rows])
+    rows = list(lines_of(text, _COMMENT))
+    comments = ((k, s.lstrip(" \t#%/!;")) for k, s in lines_of(text) if s.lstrip().startswith(_COMMENT))
+    separator = separator_of([_BRACKETS.sub(" ", s) for _, s in rows])
     lines = [_Line(k, _cells(s, separator)) for k, s in rows]
     return lines, [_Line(k, _cells(s, separator if separator in s else " ")) for k, s in comments if s]
 
 
-def _separator(rows: Sequence[str]) -> str:
-    sample = rows[: min(len(rows), 50)]
-    for mark in (";", "\t"):
-        if sample and sum(mark in s for s in sample) >= 0.8 * len(sample):
-            return mark
-    # commas between blanks are separators; a comma inside of every number is a decimal comma
-    if sample and all(
-        len(re.findall(r"\d,\d", s)) and "." not in s and len(s.split()) > 2 for s in sample[1:] or sample
-    ):
-        return " "
-    return "," if any("," in s for s in sample) else " "
-
-
 def _cells(line: str, separator: str) -> list[str]:
-    plain = re.sub(r"[\[\](){}]", " " if separator != "," else "", line) if separator in ", " else line
-    if separator == " ":
-        cells = plain.split()
-    elif separator == ",":
-        cells = [c.strip() for part in [plain] for c in part.split(",")]
-        # blanks may separate numbers, too
+    plain = _BRACKETS.sub(" " if separator == " " else "", line) if separator in ", " else line
+    cells = cells_of(plain, separator)
+    if separator == ",":  # blanks may separate numbers, too
         cells = [word for cell in cells for word in (cell.split() if _all_numbers(cell) else [cell])]
-    else:
-        cells = [c.strip() for c in plain.split(separator)]
     while len(cells) > 1 and cells[-1] == "":
         cells.pop()
-    cells = [c.strip().strip("\"'") for c in cells]
-    if separator != ",":
-        cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
-    return cells
+    return [c.strip("\"'") for c in cells]
 
 
 def _all_numbers(cell: str) -> bool:
@@ -313,9 +316,6 @@ def _named(header: Sequence[str]) -> int:
 def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
     header = distinct(header)
     _, other = columns_of(header)
-    again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
-    if again is not None:
-        raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
     child = next((k for k, h in enumerate(header) if h.lower().endswith("child_frame_id")), None)
     if child is not None:
         parent = next((k for k, h in enumerate(header) if h.lower().endswith("frame_id") and k != child), child)
@@ -366,6 +366,9 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     Raises:
         DatasetError: a list has no position or no rotation, or an angle of a joint is none.
     """
+    again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
+    if again is not None:
+        raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
     columns, other = columns_of(header)
     times = table[:, other["time"]] if "time" in other else None
     if times is not None:

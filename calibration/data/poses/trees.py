@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array, looks_like_poses
 from weldcal.calibration.data.poses.names import columns_of, natural
+from weldcal.calibration.data.poses.storage import array_of
 from weldcal.calibration.data.poses.text import joints_rad, table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -61,7 +62,7 @@ def _joints(tree: Any, name: str) -> tuple[Array, str] | None:
     node = next((v for v in tree.values() if _is_samples(v)), tree) if isinstance(tree, Mapping) else tree
     keys = node[0] if _is_samples(node) else node if isinstance(node, Mapping) else {}
     for key in (k for k in keys if _JOINTS.match(str(k))):
-        q = _array([one.get(key) for one in node] if _is_samples(node) else node[key])
+        q = array_of([one.get(key) for one in node] if _is_samples(node) else node[key])
         if q is not None and q.ndim == 2 and len(q) > 1 and 5 <= q.shape[1] <= 7 and np.isfinite(q).all():
             return joints_rad(q, next(iter(re.findall("(?i)(deg|rad)$", str(key))), "").lower(), name)
     return None
@@ -84,7 +85,7 @@ def _collect(node: Any, name: str, at: str) -> Iterator[Listing]:
 
 
 def _of_list(node: list[Any], name: str, at: str, label: str) -> Iterator[Listing]:
-    array = _array(node)
+    array = array_of(node)
     if (
         array is not None
         and array.ndim in (3, 4)
@@ -129,7 +130,7 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
             poses = _stack(values, f"{name}, {key}", label)
             if poses is not None:
                 yield listing_of_array(f"{name}, {key}", poses)
-    yield from _partners({k: [item.get(k) for item in node] for k in node[0]}, name, at)
+    yield from (one for one, _ in _joined({k: [item.get(k) for item in node] for k in node[0]}, name, at))
 
 
 def _stack(values: list[Any], name: str, label: str) -> Array | None:
@@ -140,7 +141,7 @@ def _stack(values: list[Any], name: str, label: str) -> Array | None:
     Raises:
         DatasetError: a sample has other numbers than most.
     """
-    arrays = [_array(v) if isinstance(v, list | np.ndarray) else None for v in values]
+    arrays = [array_of(v) if isinstance(v, list | np.ndarray) else None for v in values]
     sizes = [a.size for a in arrays if a is not None and a.size in (6, 7, 12, 16)]
     size = max(set(sizes), key=sizes.count) if sizes else 0
     if not size or 2 * sizes.count(size) < len(values):
@@ -172,7 +173,7 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
             k: v for k, v in node.items() if str(k).lower() not in roots and isinstance(v, Mapping | list | np.ndarray)
         }
         if len(roots) > 1:  # the whole mapping is the pose, but for matrices beside it
-            beside = {k: v for k, v in beside.items() if (a := _array(v)) is not None and a.size in (12, 16)}
+            beside = {k: v for k, v in beside.items() if (a := array_of(v)) is not None and a.size in (12, 16)}
             keys = [str(k) for k, v in node.items() if isinstance(v, list) and _flat({k: v})]
             stem = re.sub(
                 "_?(r|t|rot|trans)?(vec|rotation|translation|position|orientation)$", "", min(keys, default="")
@@ -287,13 +288,8 @@ def _joined(node: Mapping[Any, Any], name: str, at: str) -> Iterator[tuple[Listi
                 break
 
 
-def _partners(node: Mapping[Any, Any], name: str, at: str) -> Iterator[Listing]:
-    for listing, _ in _joined(node, name, at):
-        yield listing
-
-
 def _rotations_and_positions(R: Any, t: Any, label: str, key: str) -> Listing | None:
-    turn, at = (v if isinstance(v, np.ndarray) else _array(v) if isinstance(v, list) else None for v in (R, t))
+    turn, at = (v if isinstance(v, np.ndarray) else array_of(v) if isinstance(v, list) else None for v in (R, t))
     if (
         turn is None
         or at is None
@@ -333,7 +329,7 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
         elif isinstance(value, int | float) and not isinstance(value, bool):
             out[path] = as_number(value)
         elif isinstance(value, list | np.ndarray):
-            numbers = value if isinstance(value, np.ndarray) else _array(value)
+            numbers = value if isinstance(value, np.ndarray) else array_of(value)
             if numbers is not None and numbers.dtype.kind in "fiu":
                 out |= _spelled(path, str(key), np.asarray(numbers, dtype=float).ravel())
         elif isinstance(value, str):
@@ -348,7 +344,7 @@ def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
     """Return an angle about an axis as a rotation vector, an orientation vector under its names; empty for others."""
     if {"x", "y", "z", "th"} <= set(value):
         return {f"{path}.{k if k == 'th' else f'o_{k}'}": as_number(value[k]) for k in ("x", "y", "z", "th")}
-    axis, angle = _array(value.get("axis")) if isinstance(value.get("axis"), list) else None, value.get("angle")
+    axis, angle = array_of(value.get("axis")) if isinstance(value.get("axis"), list) else None, value.get("angle")
     if axis is None or axis.shape != (3,) or not isinstance(angle, int | float):
         return {}
     size = float(np.linalg.norm(axis))
@@ -373,12 +369,3 @@ def _spelled(path: str, key: str, numbers: Array) -> dict[str, float]:
     if numbers.size == 3 and re.search(r"(?i)(rot|ori|euler|angles?|rxyz)", key):
         return dict(zip((f"{parent}r{a}" for a in "xyz"), map(float, numbers), strict=True))
     return {}
-
-
-def _array(value: Any) -> Array | None:
-    """Nested lists of numbers as an array; None where they are none."""
-    try:
-        found = np.array(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return found

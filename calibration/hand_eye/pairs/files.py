@@ -13,23 +13,22 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.bag import FEWEST_RESTS, at_rest, find_bag, lists_of_recording
-from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import PICKLED, folder_lists, read_lists, two_lists
-from weldcal.calibration.data.poses.names import ENDINGS, mounting_name
+from weldcal.calibration.data.poses.formats import EXTRAS, format_of, known_forms, may_hold_poses, read_recording
+from weldcal.calibration.data.poses.listing import Listing, require_pose
+from weldcal.calibration.data.poses.lists import folder_lists, two_lists
+from weldcal.calibration.data.poses.names import TREES, mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
-from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, NEAREST_M, StatedForms, import_pairs
-from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, file_size
+from weldcal.models.files import LARGEST_NUMBER
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
-_EXTRAS = ("X_true", "img", "obj", "K", "dist", "q")
 LENGTHS = UNITS
+NO_MOUNTING = "'{}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +119,12 @@ def pairs_of_lists(
 
 
 def _pairs(
-    path: Path, lists: list[Listing], raw: dict[str, Any], mounting: str | None, length: str | None, stated: StatedForms
+    path: Path,
+    lists: list[Listing],
+    raw: Mapping[str, Any],
+    mounting: str | None,
+    length: str | None,
+    stated: StatedForms,
 ) -> PosePairs:
     more: dict[str, Listing] = {}
     for who, names in _MORE.items():
@@ -141,11 +145,12 @@ def _pairs(
             stated, robot=replace(stated.robot, frame="base_in_flange")
         )  # easy_handeye then stores the base in the hand
     arm = stated.arm or _word(path, raw, "robot")
-    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit, arm=arm))
+    by = f"the unit in '{path.name}'" if unit else stated.unit_by
+    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit, unit_by=by, arm=arm))
     found_pairs = import_pairs(lists, path.name, mode, stated)
     rows_r, rows_c = found_pairs.rows
     arrays: dict[str, Array | None] = {}
-    for key in _EXTRAS:
+    for key in EXTRAS:
         value = raw.get(key)
         arrays[key] = None if value is None else _array(path, key, value)
     if arrays["q"] is None and found_pairs.joints is not None and np.isfinite(found_pairs.joints).all():
@@ -184,7 +189,7 @@ def _pairs(
 def recorded_lists(path: Path, stated: StatedForms) -> tuple[Listing, Listing] | None:
     """Return the robot's and the camera's stamped poses of a ROS recording; None where there are others or none."""
     beside = path.iterdir() if path.is_dir() else ()
-    if any(p.suffix.lower() in ENDINGS and p.name not in ("dataset.yaml", "metadata.yaml") for p in beside):
+    if any(may_hold_poses(p) and p.name not in ("dataset.yaml", "metadata.yaml") for p in beside):
         return None
     bag = find_bag(path) if path.exists() else None
     if bag is None:
@@ -193,14 +198,14 @@ def recorded_lists(path: Path, stated: StatedForms) -> tuple[Listing, Listing] |
     return two_lists(lists, path.name, stated.robot_poses, stated.camera_poses)
 
 
-def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], dict[str, Any]]:
+def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], Mapping[str, Any]]:
     """Return the lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
     recorded = recorded_lists(path, stated)
     if recorded is not None:
         if (lists := at_rest(*recorded)) is None:
             raise DatasetError(
                 f"'{path.name}' has fewer than {FEWEST_RESTS} poses at which the arm rested and the camera saw the"
-                " board: let it rest for a second at each pose, and record again. (`hand-eye` also reads a motion.)"
+                " board, and no motion of 3 s. Let it rest for a second at each pose, and record again."
             )
         return lists, {}
     if path.is_dir():
@@ -220,44 +225,13 @@ def _contents(path: Path, stated: StatedForms) -> tuple[list[Listing], dict[str,
             "poses": raw.get("poses"),
             "robot": raw.get("robot"),
         }
-    file_size(path)
-    ending = path.suffix.lower()
-    if ending in (".pkl", ".pickle"):
-        raise DatasetError(PICKLED.format(path.name))
-    if ending == ".npz":
-        arrays = read_npz(path)
-        if "hand" in arrays and "eye" in arrays:
-            raise DatasetError(
-                f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B"
-                " (n, 4, 4)."
-            )
-        raw = {k: arrays[k] for k in _EXTRAS if k in arrays}
-        raw["mode"], raw["unit"] = (
-            next((str(_scalar(arrays[k])) for k in keys if k in arrays and np.size(arrays[k]) == 1), "")
-            for keys in (("mode", "configuration"), ("unit",))
+    found = read_recording(path)
+    if format_of(path).endings == TREES and len(found.lists) == 1 == len(found.lists[0]):
+        raise DatasetError(
+            f"'{path.name}' has only one pose, so it seems to be the result of a calibration. Give the file of the"
+            " samples instead. To test this result on the samples, use 'weldcal verify'."
         )
-        return lists_of_tree({k: v for k, v in arrays.items() if k not in raw or k == "q"}, path.name), raw
-    if ending in (".yml", ".yaml", ".json", ".xml", ".samples", ".calib"):
-        tree = read_tree(path)
-        raw = (
-            {k: tree[k] for k in (*_EXTRAS, "mode", "configuration", "unit") if k in tree}
-            if isinstance(tree, dict)
-            else {}
-        )
-        parameters = tree.get("parameters") if isinstance(tree, dict) else None
-        kind = parameters.get("calibration_type") if isinstance(parameters, dict) else None
-        raw["mode"] = raw.get("mode") or raw.pop("configuration", None) or kind
-        samples = tree.get("samples", tree.get("poses")) if isinstance(tree, dict) else tree
-        if isinstance(samples, list) and samples and all(isinstance(one, dict) and "q" in one for one in samples):
-            raw["q"] = [one["q"] for one in samples]
-        lists = lists_of_tree(tree, path.name)
-        if len(lists) == 1 and len(lists[0]) == 1:
-            raise DatasetError(
-                f"'{path.name}' has only one pose, so it seems to be the result of a calibration. Give the file of the"
-                " samples instead. To test this result on the samples, use 'weldcal verify'."
-            )
-        return lists, raw
-    return read_lists(path), {}
+    return require_pose(found.lists), found.stated
 
 
 def _pictures(folder: Path, n: int) -> str:
@@ -289,20 +263,15 @@ def _no_lists(folder: Path) -> str:
             " into camera01.yaml ... (4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use"
             " weldcal calibrate."
         )
-    unknown = sorted({Path(n).suffix for n in names if Path(n).suffix.lower() not in ENDINGS})
-    also = f" Files {', '.join(unknown[:4])} are not read." if unknown else ""
+    unknown = sorted({Path(n).suffix for n in names if not may_hold_poses(Path(n))})
+    also = f" Files {', '.join(unknown[:4])} are not read, but {known_forms()}." if unknown else ""
     return (
         f"'{folder.name}' holds no poses.{also} Give robot.csv and camera.csv, folders robot/ and camera/ with one file"
         " per pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
     )
 
 
-def _scalar(value: Array) -> object:
-    word = np.ravel(value)[0]
-    return word.decode("utf-8", "replace") if isinstance(word, bytes) else word
-
-
-def _mode(path: Path, raw: dict[str, Any], mounting: str | None, two_robots: bool) -> str:
+def _mode(path: Path, raw: Mapping[str, Any], mounting: str | None, two_robots: bool) -> str:
     found = _word(path, raw, "mode")
     found = mounting_name(found) if found else found  # other tools' words
     if found and mounting and found != mounting:
@@ -311,21 +280,19 @@ def _mode(path: Path, raw: dict[str, Any], mounting: str | None, two_robots: boo
         )
     mode = mounting or found or ("co_manipulation" if two_robots else None)
     if mode is None:
-        raise DatasetError(
-            f"'{path.name}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
-        )
+        raise DatasetError(NO_MOUNTING.format(path.name))
     get_mounting(mode)
     return mode
 
 
-def _word(path: Path, raw: dict[str, Any], key: str) -> str | None:
+def _word(path: Path, raw: Mapping[str, Any], key: str) -> str | None:
     value = raw.get(key) or None
     if value is not None and not isinstance(value, str):
         raise DatasetError(f"'{path.name}' must name its {key} by a word.")
     return value
 
 
-def _stated_in(path: Path, raw: dict[str, Any], stated: StatedForms) -> StatedForms:
+def _stated_in(path: Path, raw: Mapping[str, Any], stated: StatedForms) -> StatedForms:
     """What dataset.yaml states of the two lists, below what the command states."""
     forms = raw.get("poses")
     if not isinstance(forms, dict):

@@ -1,7 +1,4 @@
-"""Import pairs of robot and camera poses.
-
-Find the two lists, pair their rows, and let the data choose how they are read.
-"""
+"""Import pairs of robot and camera poses: find both lists, pair their rows, and let the data choose the reading."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
-from weldcal.calibration.data.poses.readings import PoseReading, pick
+from weldcal.calibration.data.poses.readings import PoseReading, change_of, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.robust import Rows
 from weldcal.calibration.geometry.se3 import scaled
@@ -44,13 +41,14 @@ it."""
 
 @dataclass(frozen=True, kw_only=True)
 class StatedForms:
-    """What the user states of the two lists: form and name of each, the unit of lengths of both, and the robot."""
+    """What the user states of the two lists: form and name of each, the unit and who states it, the robot."""
 
     robot: PoseForm = field(default_factory=PoseForm)
     camera: PoseForm = field(default_factory=PoseForm)
     robot_poses: str | None = None
     camera_poses: str | None = None
     unit: str | None = None
+    unit_by: str = "--unit"
     decide: bool = True  # whether the data choose the reading: not where the file holds motions
     arm: str | None = None  # the robot whose joint angles stand for its poses
     camera_known: bool = False  # whether the camera's poses were computed here, so that their reading is no question
@@ -150,7 +148,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         units = _units(A, B, robot, camera, None, stated, source)
     else:
         best = decision.best
-        _require_one(decision, source, mounting, stated.camera_known)
+        _require_one(decision, (a, b), (robot, camera), source, mounting, stated.camera_known)
         A, B = [_of_all_rows(_changed(listed, one), one) for listed, one in ((a, best.robot), (b, best.camera))]
         notes += _sentences(decision, robot, camera, shift)
         units = _units(A, B, robot, camera, best, stated, source)
@@ -217,12 +215,14 @@ def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
 
 
 def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading]:
-    """The readings, and the wanted one's changes applied to them all."""
-    found = list(listed)
-    for change in ("transposed", "left_handed", "inverse"):
-        if wanted.form.endswith(f",{change}"):
-            found += [one.changed(change) for one in listed if f"{one.form},{change}" == wanted.form]
-    return found
+    """The readings, and the wanted one's change applied to them all."""
+    by = change_of(wanted, listed)
+    return listed if by is None else [*listed, *(one.changed(by) for one in listed)]
+
+
+def _option(who: str, one: PoseReading, listing: Listing) -> str:
+    """Return the option that states a reading; the name of a list may invert it beyond that."""
+    return f"--as {who}-form={(one.changed('inverse') if named_inverse(listing) else one).form}"
 
 
 def _ordered(robot: Listing, camera: Listing, mounting: str, *, sure: bool = True) -> tuple[Rows, Rows] | None:
@@ -282,7 +282,6 @@ def _left_out(listing: Listing, rows: Array, out: Array) -> list[str]:
 
 
 def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
-    """Refuses a list whose poses are all one. Raises InconsistentPoses."""
     X = reading.X
     if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
         raise InconsistentPoses(
@@ -312,8 +311,15 @@ def decided(
     return (best, by) if best.best.agrees or len(a) > 1 or len(b) > 1 else (None, 0)
 
 
-def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_known: bool) -> None:
-    """Refuses readings that agree equally and differ in the result. Raises InconsistentPoses."""
+def _require_one(
+    decision: ReadingDecision,
+    stated: tuple[list[PoseReading], list[PoseReading]],
+    lists: tuple[Listing, Listing],
+    source: str,
+    mounting: str,
+    camera_known: bool,
+) -> None:
+    """Raise InconsistentPoses where readings agree equally and differ, or take back a stated change."""
     best = decision.best
     other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
     if not best.agrees:
@@ -326,19 +332,22 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
                 " --as robot-form=FORM and --as camera-form=FORM."
             )
         return
-    if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
-        form = best.robot.form if best.robot.form.endswith(",inverse") else f"{best.robot.form},inverse"
+    ones = (best.robot, best.camera)
+    own = [change_of(one, listed) for one, listed in zip(ones, stated, strict=True)]
+    by, k = own[0] or own[1], int(own[0] is None)  # the change beyond what is stated, and whose list it is
+    options = [
+        _option(who, one if mine or by is None else one.changed(by), listing)
+        for who, one, mine, listing in zip(("robot", "camera"), ones, own, lists, strict=True)
+    ]
+    if by == "inverse":
+        corrections = [f"the camera is mounted {other} (--mounting {other})"]
+        for who, option in list(zip(("robot", "camera"), options, strict=True))[: 1 if camera_known else 2]:
+            corrections.append(f"the {who} poses are {'' if option.endswith(by) else 'not '}inverted ({option})")
+        what, whom = ("robot poses", "the pictures") if camera_known else ("poses", "each other")
         raise InconsistentPoses(
-            f"With --mounting {mounting} the robot poses of '{source}' contradict the pictures. Two corrections fit"
-            f" equally well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), or the robot poses"
-            f" are inverted (--as robot-form={form}). Give the option that is true."
-        )
-    if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
-        raise InconsistentPoses(
-            f"With --mounting {mounting} the poses of '{source}' contradict each other. Three corrections fit equally"
-            f" well ({_residual(best)}): the camera is mounted {other} (--mounting {other}), the robot poses are"
-            f" inverted (--as robot-form={_option(best.robot, 'inverse')}), or the camera poses are inverted"
-            f" (--as camera-form={_option(best.camera, 'inverse')}). Give the option that is true."
+            f"With --mounting {mounting} the {what} of '{source}' contradict {whom}."
+            f" {'Two' if camera_known else 'Three'} corrections fit equally well ({_residual(best)}):"
+            f" {', '.join(corrections[:-1])}, or {corrections[-1]}. Give the option that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
@@ -347,11 +356,11 @@ def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_k
             f" ({_residual(best)}), or {_pair_words(rival)} ({_residual(rival)}). State the right one:"
             f" {_options(best)}, or {_options(rival)}."
         )
-
-
-def _option(reading: PoseReading, change: str) -> str:
-    plain = reading.form.removesuffix(f",{change}")
-    return f"{plain},{change}"
+    if by is not None and not ones[k].form.endswith(by):
+        raise InconsistentPoses(
+            f"The {('robot', 'camera')[k]} poses of '{source}' are stated as {by}, and agree only if they are not"
+            f" ({_residual(best)}): state {options[k]}."
+        )
 
 
 def _options(one: ReadingAgreement) -> str:
@@ -431,7 +440,7 @@ def _units(
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < NEAREST_M):
         raise DatasetError(
             f"Read in {words[0]}, the robot positions of '{source}' have a median distance of {median * unit_r:.3g} m"
-            " from the base. No arm has that reach: correct --unit."
+            f" from the base. No arm reaches that: correct {'the unit in the file' if robot.unit else stated.unit_by}."
         )
     ratio = None
     if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
+from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
@@ -92,6 +93,7 @@ class AddedMotion(AddedJob):
     monitor: DriftMonitor | None
     queue: FrameQueue
     recorder: MotionRecorder | None
+    header: DatasetHeader
     frames: int
 
     def record(self, root: Context) -> MotionRecord:
@@ -194,9 +196,19 @@ class MotionCalibrationJob(Job[MotionPlanned]):
             sample_time=wiring.out(f"{FIRST}.sample_time"),
         )
         spine.serve(procedure, record=record)
-        calibrator, monitor = None, None
+        calibrator, monitor, scanner = None, None, scenario.scanner_config()
+        assert scanner is not None
+        header = DatasetHeader(
+            robot=scenario.arm,
+            flange=scenario.flange_name(),
+            scanner=scanner.scanner().name,
+            configuration="eye_on_base",
+            note="a run of the motion job",
+        )
         if watched is None:
-            calibrator = wiring.add("motion_calibrator", MotionCalibrator(station.arm, station.background))
+            calibrator = wiring.add(
+                "motion_calibrator", MotionCalibrator(station.arm, station.background, header=header)
+            )
             wiring.connect(calibrator, record=record, state=state)
             wiring.connect(procedure, calibration=calibrator.GetOutputPort("calibration"))
         else:
@@ -227,6 +239,7 @@ class MotionCalibrationJob(Job[MotionPlanned]):
             monitor=monitor,
             queue=queue,
             recorder=recorder,
+            header=header,
             frames=job.frames,
             ports=procedure.ports(logged=logged, shown=shown),
             maximum_time_s=maximum_time_s,

@@ -13,13 +13,13 @@ from weldcal.calibration.data.clouds import save_cloud
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.frames import observed_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.recorded_motion import RecordedMotion, calibrate_frames
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
 from weldcal.systems.leaf_system import LeafSystem
@@ -62,8 +62,13 @@ class MotionCalibration(Message):
     """The calibration, or the reason why there is none; `asked` counts what was asked for."""
 
     asked: int = 0
-    estimate: MotionEstimate | None = None
+    found: RecordedMotion | None = None
     reason: str = ""
+
+    @property
+    def estimate(self) -> MotionEstimate | None:
+        """The estimate of what was found."""
+        return None if self.found is None else self.found.estimate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -146,7 +151,7 @@ class MotionProcedure(Procedure[MotionState, MotionInputs]):
     def _calibrated(self, s: MotionState, now: MotionInputs) -> MotionState:
         if not now.calibration.asked:
             return s
-        if now.calibration.estimate is None:
+        if now.calibration.found is None:
             return self.held(s, now, now.calibration.reason)
         return self.enter(s, now, "done")
 
@@ -231,9 +236,15 @@ class MotionCalibrator(BackgroundSystem):
         - calibration
     """
 
-    def __init__(self, arm: ArmModel, background: Background | None = None, period_s: float = 0.02) -> None:
+    def __init__(
+        self,
+        arm: ArmModel,
+        background: Background | None = None,
+        period_s: float = 0.02,
+        header: DatasetHeader | None = None,
+    ) -> None:
         super().__init__("calibration", MotionCalibration(), background, period_s)
-        self._arm = arm
+        self._arm, self._header = arm, header or DatasetHeader()
         self._record = self.DeclareAbstractInputPort("record", AbstractValue.Make(MotionRecord()))
         self._job = self.DeclareAbstractInputPort("state", AbstractValue.Make(MotionState()))
 
@@ -241,17 +252,24 @@ class MotionCalibrator(BackgroundSystem):
         """Ask for the calibration once, when everything has been collected."""
         if newest.asked or self._job.Eval(context).phase != "calibrate":
             return None
-        return self.background.ask(calibrate_record, self._record.Eval(context), self._arm)
+        return self.background.ask(calibrate_record, self._record.Eval(context), self._arm, self._header)
 
 
-def calibrate_record(record: MotionRecord, arm: ArmModel) -> MotionCalibration:
+def calibrate_record(record: MotionRecord, arm: ArmModel, header: DatasetHeader) -> MotionCalibration:
     """Calibrate from a record; without a result, the reason is given and no exception is raised.
 
-    The robot's own kinematics are used, so that its factory calibration counts.
+    The robot's own kinematics are used, so that its factory calibration counts. ``header`` names robot, flange and
+    scanner.
     """
+    frames = observed_frames([f for f, _ in record.seen], {f.id: fit for f, fit in record.seen})
     try:
-        frames = observed_frames([f for f, _ in record.seen], {f.id: fit for f, fit in record.seen})
-        return MotionCalibration(1, estimate_in_motion(frames, ContinuousMotion(posed_stream(record, arm))))
+        motion = ContinuousMotion(posed_stream(record, arm))
+        return MotionCalibration(
+            1,
+            calibrate_frames(
+                frames, motion, record.refused, robot=header.robot, flange=header.flange, scanner=header.scanner
+            ),
+        )
     except WeldcalError as error:
         return MotionCalibration(1, reason=str(error))
 
@@ -294,14 +312,7 @@ class MotionRecorder(LeafSystem):
             self._frames.append(FrameTime(id, frame.arrival_time, frame.device_time))
         return EventStatus.Succeeded()
 
-    def finish(self, stream: RobotStream, robot: str, flange: str, scanner: ScannerPreset) -> int:
+    def finish(self, stream: RobotStream, header: DatasetHeader) -> int:
         """Write dataset.yaml, stream.csv and frames.csv; returns the number of frames."""
-        header = DatasetHeader(
-            robot=robot,
-            flange=flange,
-            scanner=scanner.name,
-            configuration="eye_on_base",
-            note="a run of the motion job",
-        )
         save_motion_dataset(self.folder, header, stream, self._frames, ())
         return len(self._frames)

@@ -3,31 +3,22 @@
 import dataclasses as dc
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.data.header import DatasetHeader, ScannerGuess, SecondRobot, placed
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.planning.mounting_estimate import (
-    Circle,
-    MountingResult,
-    ObservedCircle,
-    expected_after,
-    expected_error,
-    fewest,
-    off_prediction,
-    see_circle,
-    solve_mounting,
-)
+from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
-from weldcal.calibration.planning.mounting_scene import FLANGE, FOOT, MountingScene
-from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
+from weldcal.calibration.planning.mounting_scene import MountingScene
+from weldcal.calibration.recorded_carried import described_scene
+from weldcal.models.arms.kinematics import LINKS, ArmModel
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError, WeldcalError
-from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.errors import InputError
 from weldcal.models.robots import base_circle
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.background import Answer, Background, BackgroundSystem
@@ -36,13 +27,7 @@ from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.mounting.config import MountingJob
-from weldcal.systems.jobs.mounting.procedure import (
-    HeldOutScan,
-    MountingProcedure,
-    MountingState,
-    MountingStatus,
-    NextBest,
-)
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.motion.spine import Spine
@@ -118,62 +103,26 @@ def digest(
     config: MountingFitConfig,
     plan: Sequence[MountingPose],
 ) -> MountingStatus:
-    """Compute the status after one more scan; an unusable scan is listed as refused with its label and the reason."""
+    """Compute the status after one more scan, as `weldcal calibrate` does; then the pose that would help most."""
     status = dc.replace(status, sequence=scan.sequence)
     q, q_2 = joints
     if q is None or (scene.two and q_2 is None):
-        reason = "the arm's pose at the time of the scan is not known"
-        return dc.replace(status, refused=(*status.refused, (job.label, reason)), message=reason)
-    belief = scene if status.result is None else scene.believing(status.result.poses)
-    try:
-        seen = see_circle(scan.points_C.astype(float), belief, job.label, q, q_2, config.circle)
-    except FlangeNotFound as error:
-        return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
-    if job.purpose == "verify":
-        off = off_prediction(belief, seen, None if status.result is None else status.result.correction)
-        return dc.replace(status, held_out=(*status.held_out, HeldOutScan(job.label, *off)))
-    status = dc.replace(status, seen=(*status.seen, seen), message="")
-    if len(status.seen) < fewest(scene):
-        return status
-    try:
-        result = solve_mounting(scene, status.seen)
-    except WeldcalError as error:
-        return dc.replace(status, message=str(error))
-    sigma, within = expected_error(scene, result)
-    return dc.replace(
-        status,
-        result=result,
-        sigma_work_m=sigma,
-        error_95_m=within,
-        history=(*status.history, (len(status.seen), within)),
-        next_best=next_best(scene.believing(result.poses), result, status.seen, plan),
-        done=len(status.seen) >= config.minimum_scans and within <= config.required_error_m,
-    )
-
-
-def next_best(
-    belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
-) -> NextBest | None:
-    """Return the unvisited planned pose that reduces the expected error at the work point most.
-
-    All are reachable, visible and clear; None where all were visited.
-    """
-    left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
-    if not left:
-        return None
-    after = expected_after(belief, result, seen, left)
-    best = left[int(np.argmin(after))]
-    return NextBest(
-        best.q, best.q_2, belief.frames(best.q)[FLANGE], expected_error(belief, result)[0], float(after.min())
-    )
+        return status.refusing(job.label, "the arm's pose at the time of the scan is not known")
+    verify, points = job.purpose == "verify", scan.points_C.astype(float)
+    found = status.with_scan(scene, config.circle, job.label, points, (q, q_2), held_out=verify)
+    if found.result is status.result:
+        return found
+    done = len(found.seen) >= config.minimum_scans and found.error_95_m <= config.required_error_m
+    return dc.replace(found.proposing(scene, plan), done=done)
 
 
 @dataclass(frozen=True, eq=False)
 class MountingPlanned:
-    """The scene as known before the first scan, the dimensions of the circle, and the poses to visit."""
+    """The header of the scans' dataset, the scene before the first scan, the circle, and the poses to visit."""
 
+    header: DatasetHeader
     scene: MountingScene
-    standard: FlangeStandard
+    circle: Circle
     poses: tuple[MountingPose, ...]
 
 
@@ -181,6 +130,7 @@ class MountingPlanned:
 class AddedMounting(AddedJob):
     """The systems of the job; `truth` (X, and Y or Z where they are estimated) is for reports and tests only."""
 
+    header: DatasetHeader
     scene: MountingScene
     plan: tuple[MountingPose, ...]
     scans: int
@@ -228,8 +178,8 @@ class MountingCalibrationJob(Job[MountingPlanned]):
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MountingPlanned:
         """See Job."""
-        scene, standard = mounting_scene(scenario, station.arm)
-        return MountingPlanned(scene, standard, plan_mounting(scenario, scene, seed))
+        header, scene, circle = mounting_scene(scenario, station.arm)
+        return MountingPlanned(header, scene, circle, plan_mounting(scenario, scene, seed))
 
     def add(self, wiring: Wiring, spine: Spine, plan: MountingPlanned) -> AddedMounting:
         """See Job."""
@@ -240,8 +190,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
             "mounting_procedure",
             MountingProcedure(plan.poses, c.maximum_scans, c.verification_scans, home, maximum_time_s=maximum_time_s),
         )
-        circle = Circle(plan.standard, c.guess_radius_mm * 1e-3, c.configuration in FOOT)
-        fit = MountingFitConfig(circle, c.minimum_scans, c.required_error_mm * 1e-3)
+        fit = MountingFitConfig(plan.circle, c.minimum_scans, c.required_error_mm * 1e-3)
         calibrator = wiring.add(
             "mounting_calibrator", MountingCalibrator(scene, fit, plan.poses, wiring.station.background)
         )
@@ -254,6 +203,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
             wiring.connect(procedure, settled_goal_2=second.settled_goal, robot_status_2=second.status)
         shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
         return AddedMounting(
+            header=plan.header,
             scene=scene,
             plan=plan.poses,
             scans=c.maximum_scans + c.verification_scans,
@@ -265,35 +215,33 @@ class MountingCalibrationJob(Job[MountingPlanned]):
         )
 
 
-def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """Return the scene as known before the first scan, from drawings and rough measurements.
+def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[DatasetHeader, MountingScene, Circle]:
+    """Return the header of a dataset of the run's scans, the scene as known before the first one, and the circle.
 
-    And the dimensions of the circle.
+    From drawings and rough measurements.
     """
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
-    carrier = scanner.mounted_on
-    link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
-    circle = base_circle(scenario.arm) if c.configuration in FOOT else None
-    standard = get_flange(scenario.flange_name()) if circle is None else circle.standard
-    second = job.second_arm
-    scene = MountingScene(
+    preset, guess, second = scanner.scanner(), c.mounting_guess.pose(), job.second_arm
+    header = DatasetHeader(
+        robot=scenario.arm,
+        flange=scenario.flange_name(),
+        scanner=preset.name,
         configuration=c.configuration,
-        arm=arm,
-        link=link,
-        X_LC=c.mounting_guess.pose(),
-        X_HR=RigidTransform() if circle is None else circle.X_BR,
-        radius_m=0.5 * standard.outer_m,
-        scanner=scanner.scanner(),
-        q_home=np.deg2rad(scenario.home_deg),
-        target_known=job.target_known,
-        arm_2=None if second is None else load_arm(second.arm),
-        X_BD=None if second is None else second.pose(),
-        q_home_2=None if second is None else np.deg2rad(second.home_deg),
-        surroundings=surroundings_of(scenario),
+        note="scans of a run",
+        scanner_guess=ScannerGuess(**placed(guess), radius_m=c.guess_radius_mm * 1e-3),
+        scanner_link=scanner.mounted_on if scanner.mounted_on in LINKS else "",
     )
-    return scene, standard
+    known: dict[str, Any] = {
+        "scanner": preset,
+        "target_known": job.target_known,
+        "surroundings": surroundings_of(scenario),
+    }
+    if second is not None:
+        header.second_robot = SecondRobot(robot=second.arm, **placed(second.pose()))
+        known |= {"X_BD": second.pose(), "q_home_2": np.deg2rad(second.home_deg)}
+    return header, *described_scene(header, arm, guess, np.deg2rad(scenario.home_deg), **known)
 
 
 def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[MountingPose, ...]:

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.mounting_estimate import MountingResult, ObservedCircle
 from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.calibration.recorded_carried import CarriedCalibration
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
 from weldcal.systems.messages import JobCommand, Message, UrStatus
@@ -31,55 +30,12 @@ class MountingState(ProcedureState):
     scanned: str = ""  # label of the newest scan
 
 
-@dataclass(frozen=True)
-class HeldOutScan:
-    """Errors of the calibration's prediction of the circle in a held-out scan."""
-
-    label: str
-    error_m: float
-    tilt_rad: float
-
-
-@dataclass(frozen=True)
-class NextBest:
-    """A pose to add: joints (6,) rad, X_BF of the first arm, and the sigma of a scanned point without and with it.
-
-    The sigma is 3-D, predicted, in m.
-    """
-
-    q: Array
-    q_2: Array | None
-    X_BF: RigidTransform
-    sigma_before_m: float
-    sigma_after_m: float
-
-    def sentence(self) -> str:
-        """Return the proposal as one sentence for the operator."""
-        joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.q))
-        second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
-        p = 1e3 * self.X_BF.translation()
-        return (
-            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would"
-            f" reduce the sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to"
-            f" {1e3 * self.sigma_after_m:.4f} mm."
-        )
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MountingStatus(Message):
-    """The calibration after its newest scan."""
+class MountingStatus(CarriedCalibration, Message):
+    """The calibration after its newest scan, and whether its error is as small as required."""
 
     sequence: int = 0
-    seen: tuple[ObservedCircle, ...] = ()
-    refused: tuple[tuple[str, str], ...] = ()
-    result: MountingResult | None = None
-    sigma_work_m: float = np.inf  # expected error (3-D, rms) of a point at the scanner's best distance
-    error_95_m: float = np.inf  # and the bound that it keeps with 95 %
-    history: tuple[tuple[int, float], ...] = ()  # of that bound, by the number of scans
-    held_out: tuple[HeldOutScan, ...] = ()
-    next_best: NextBest | None = None
     done: bool = False
-    message: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.face import IN_MOTION
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
+from weldcal.calibration.flange.holes import find_holes
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
@@ -42,7 +43,8 @@ class FlangeEstimator(BackgroundSystem):
         - flange_estimate
 
     It takes the scan that the job ordered, and every frame of a streaming scanner. The search sphere is centred at the
-    feature's position predicted from the newest X_BC (at first the nominal one) and the arm's pose at the capture time.
+    feature's position predicted from the nominal X_BC, of a streamed frame from the newest one, and the arm's pose at
+    the capture time: a dataset of the same scans is searched alike.
     A streamed frame's capture time is taken from its stamp and `delay_s`, the nominal time from capture to arrival; the
     prediction is corrected by what the frame before it showed. The fit runs beside the control loop.
     """
@@ -75,11 +77,9 @@ class FlangeEstimator(BackgroundSystem):
         job: JobCommand = self._job.Eval(context)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose == "workpiece":
             return None
-        status: CalibrationStatus = self._status.Eval(context)
         X_BF = self._history.Eval(context).pose_at(self._arm, scan.capture_time)
-        X_BC = status.X_BC or self._X_BC_guess
         return self.background.ask(
-            estimate_flange, scan, job, X_BF, self._X_FR, self._standard, X_BC, self._guess_radius_m
+            estimate_flange, scan, job, X_BF, self._X_FR, self._standard, self._X_BC_guess, self._guess_radius_m
         )
 
     def _ask_streamed(
@@ -191,4 +191,5 @@ def estimate_flange(
         fit = fit_flange(points, standard, guess=guess, config=LIVE_FIT)
     except FlangeNotFound as error:
         return dc.replace(base, reason=str(error))
-    return dc.replace(base, fit=fit, points_C=face_cloud(points, fit, standard))
+    pattern = find_holes(points, fit, standard)
+    return dc.replace(base, fit=fit, pattern=pattern, points_C=face_cloud(points, fit, standard))

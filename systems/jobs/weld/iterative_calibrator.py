@@ -13,8 +13,7 @@ from weldcal.calibration.eye_on_base.estimate import corrected_observation, sigm
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import observation_from_fit
-from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
-from weldcal.models.arms.chain import chain_of
+from weldcal.calibration.planning.calibration_poses import NextBest, PlannedPose, PlannerConfig, predicted_sigma
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -30,15 +29,14 @@ def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_
     """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason.
 
     ``arm`` is the one that observed.
-
-    Live scans have no hole patterns.
     """
     if status.estimate is None or kind == PLAIN:
         return status
     steps = Steps(
+        patterns=status.patterns,
         correct_scanner=correct_scanner,
         refine=kind,
-        arm=None if kind == "local" else chain_of(arm),
+        arm=None if kind == "local" else arm,
         joints=np.array(status.joints),
         note=f"{arm.name}, refined by a live calibration (calibration.refine: {kind})",
     )
@@ -194,11 +192,12 @@ def digest(
     observation = observation_from_fit(seen.label, X_BR, seen.fit)
     observations = (*status.observations, observation)
     joints = status.joints if q is None else (*status.joints, q)
-    status = dc.replace(status, observations=observations, joints=joints)
+    patterns = status.patterns if seen.pattern is None else {**status.patterns, seen.label: seen.pattern}
+    status = dc.replace(status, observations=observations, patterns=patterns, joints=joints)
     try:
         if len(observations) < ENOUGH:
             raise TooFewPoses(f"{len(observations)} usable scans do not fix the scanner's pose; take {ENOUGH} or more.")
-        found = calibrate(observations, Steps(correct_scanner=config.correct_scanner))
+        found = calibrate(observations, Steps(patterns=patterns, correct_scanner=config.correct_scanner))
     except WeldcalError as error:
         return dc.replace(status, message=str(error))
     estimate = found.estimate
@@ -235,25 +234,7 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
     )
 
 
-@dc.dataclass(frozen=True, eq=False)
-class NextScan(Message):
-    """A planned pose that was not visited, and the expected error (m) at the work point without and with it."""
-
-    pose: PlannedPose
-    error_now_m: float
-    error_then_m: float
-
-    def sentence(self) -> str:
-        """The proposal as one sentence for the operator."""
-        joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.pose.q))
-        p = 1e3 * self.pose.X_BF.translation()
-        return (
-            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the"
-            f" expected error at the work point from {1e3 * self.error_now_m:.3f} to {1e3 * self.error_then_m:.3f} mm."
-        )
-
-
-def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextScan | None:
+def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextBest | None:
     """The unvisited planned pose that reduces the expected error at the work point most.
 
     All are reachable, visible and clear; None before the first estimate, or where all were visited.
@@ -270,4 +251,5 @@ def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork
     after = [predicted_sigma([*seen, p.X_BR], X_BC, config) for p in left]
     best = int(np.argmin(after))
     share = after[best] / before if np.isfinite(before) else 1.0
-    return NextScan(left[best], status.predicted_error_m, share * status.predicted_error_m)
+    now = status.predicted_error_m
+    return NextBest(left[best].q, left[best].X_BF, now, share * now, what="expected error at the work point")

@@ -11,10 +11,14 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.calibrate import PLAIN
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.calibration.planning.calibration_poses import (
+    PlannedPose,
+    PlannerConfig,
+    plan_calibration_poses,
+    start_posture,
+)
 from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
-from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
@@ -26,7 +30,7 @@ from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered, se
 from weldcal.models.workpieces.seat import Press, Seated, contact_angle
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
-from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
+from weldcal.systems.motion.clear_moves import BareArm, clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import ACCELERATION_SHARE, JERK_LIMIT, MOVE_TIMEOUT_S, SPEED_SHARE
 from weldcal.systems.scenario.schema import AnglesOrder, Scenario, WeldingConfig
 from weldcal.systems.station import Station
@@ -62,7 +66,7 @@ NOZZLE_CLEAR_M = 0.001  # a choice: as the tool's body keeps from the part
 WEAVE_EVERY = 25  # places of a seam at which a weave is checked: 25 mm, a choice
 
 
-def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
+def feature_on_flange(scenario: Scenario, station: Station | BareArm) -> RigidTransform:
     """X_FR of the feature that the scanner observes."""
     if scenario.calibration.feature == "flange" or station.tool is None:
         return RigidTransform()
@@ -237,8 +241,12 @@ def seated_tip(station: Station, seam: int = 0) -> Seated:
     return numbered(cad, seam).seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
 
 
-def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | None = None) -> tuple[PlannedPose, ...]:
+def plan_poses(
+    scenario: Scenario, station: Station | BareArm, seed: int, *, count: int | None = None
+) -> tuple[PlannedPose, ...]:
     """Plan all calibration and verification poses, or ``count``, best first: reachable, visible and clear.
+
+    A bare arm starts where it holds the feature to the scanner, for the scenario's home is another arm's.
 
     Raises:
         UnreachableScanner: no such set of poses exists for the scanner at its nominal pose.
@@ -262,17 +270,15 @@ def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | 
         config = _denser(config, count)
     wanted = c.maximum_scans + c.verification_scans + SPARE_POSES if count is None else count
 
+    X_FR, X_BC = feature_on_flange(scenario, station), c.mounting_guess.pose()
+    capsules = () if tool is None else tool.capsules()
+    if isinstance(station, BareArm):
+        home = start_posture(station.arm, X_FR, X_BC, preset, config, capsules)
+        scenario = replace(scenario, home_deg=np.degrees(home).tolist())
+
     def planned(config: PlannerConfig, n: int) -> list[PlannedPose]:
-        return plan_calibration_poses(
-            station.arm,
-            feature_on_flange(scenario, station),
-            c.mounting_guess.pose(),
-            preset,
-            n,
-            q_start=np.deg2rad(scenario.home_deg),
-            config=config,
-            tool=() if tool is None else tool.capsules(),
-        )
+        start = np.deg2rad(scenario.home_deg)
+        return plan_calibration_poses(station.arm, X_FR, X_BC, preset, n, q_start=start, config=config, tool=capsules)
 
     refines = count is None and c.refine in KINDS
     poses = _telling_of_the_arm(scenario, station, planned, config, wanted) if refines else planned(config, wanted)
@@ -285,7 +291,7 @@ def _denser(config: PlannerConfig, count: int) -> PlannerConfig:
 
 def _telling_of_the_arm(
     scenario: Scenario,
-    station: Station,
+    station: Station | BareArm,
     planned: Callable[[PlannerConfig, int], list[PlannedPose]],
     config: PlannerConfig,
     wanted: int,
@@ -298,7 +304,7 @@ def _telling_of_the_arm(
             continue
         q = np.array([p.q for p in pool])
         guess, kind = scenario.calibration.mounting_guess.pose(), scenario.calibration.refine
-        return [pool[i] for i in informative_poses(chain_of(station.arm), guess, q, wanted, kind)]
+        return [pool[i] for i in informative_poses(station.arm, guess, q, wanted, kind)]
     return planned(config, wanted)
 
 

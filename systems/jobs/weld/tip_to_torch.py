@@ -17,7 +17,6 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.geometry.se3 import flange_poses
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
-from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
@@ -107,14 +106,13 @@ def _held(
 
 def _sensitivities(arm: ArmModel, tool: WeldingTool, q: Array, prior: FactoryPrior) -> tuple[Array, Array]:
     """Displacement (n, 3, k) m of tip and of torch by each error of the links, of one standard deviation."""
-    chain = chain_of(arm)
-    scale = np.tile([prior.turn_rad, prior.turn_rad, prior.offset_rad, *[prior.length_m] * 3], chain.n)
+    scale = np.tile([prior.turn_rad, prior.turn_rad, prior.offset_rad, *[prior.length_m] * 3], arm.n)
     p_FT, p_FW = tool.X_FT.translation(), tool.X_FT @ tool.p_TW
     columns: tuple[list[Array], list[Array]] = ([], [])
-    for k in range(6 * chain.n):
-        error = np.zeros(6 * chain.n)
+    for k in range(6 * arm.n):
+        error = np.zeros(6 * arm.n)
         error[k] = _DIFFERENCE * scale[k]
-        more, less = (flange_poses(chain, q, e.reshape(-1, 6)) for e in (error, -error))
+        more, less = (flange_poses(arm, q, e.reshape(-1, 6)) for e in (error, -error))
         change = (more - less) / (2.0 * _DIFFERENCE)
         for found, p in zip(columns, (p_FT, p_FW), strict=True):
             found.append(change[:, :3, :3] @ p + change[:, :3, 3])

@@ -14,7 +14,8 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, load_motion_dataset, save_motion_dataset
 from weldcal.calibration.errors import DatasetError
-from weldcal.models.arms.chain import chain_forward, chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import chain_poses, forward_kinematics
 
 HEADER = DatasetHeader(robot="ur10e", flange="iso9409-1-50-4-m6", scanner="phoxi_m", configuration="eye_on_base")
 JOINTS = np.linspace([0.1, -1.2, 1.8, -2.0, -1.4, 0.3], [0.3, -1.1, 1.7, -2.1, -1.5, 0.5], 101)
@@ -44,7 +45,7 @@ def test_read_back(tmp_path: Path, joints: bool) -> None:
     assert is_motion(tmp_path)
     assert (data.stream.joints is not None) == joints
     assert np.array_equal(data.stream.time, TIMES)
-    one = chain_forward(load_chain("ur10e"), JOINTS[7]).GetAsMatrix4()
+    one = forward_kinematics(load_chain("ur10e"), JOINTS[7]).GetAsMatrix4()
     assert np.allclose(data.stream.poses[7], one, atol=1e-9)
     assert [f.id for f in data.frames] == ["f0", "f1", "f2", "f3"]
     assert data.frames[2].device == 1.7e9 + 0.1

@@ -14,7 +14,7 @@ from tests.worlds.doctor import CAUSES, clean, make_world, observe, true_poses
 from weldcal.calibration.doctor.case import DoctorCase, case_text, read_case
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.models.arms.chain import chain_poses
+from weldcal.models.arms.kinematics import chain_poses
 from weldcal.models.errors import InputError
 from weldcal.tools.report.doctor import CHECKED, worded
 

@@ -11,8 +11,9 @@ import numpy as np
 import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.models.arms.chain import Chain, chain_inverse, load_chain
-from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import Chain, joint_frames, known_arms, load_arm
 from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import flange_mesh, get_flange
@@ -239,7 +240,8 @@ def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
         side = np.cross(towards, rng.normal(size=3))
         z = np.cos(np.radians(tilt)) * towards + np.sin(np.radians(tilt)) * side / np.linalg.norm(side)
         turn = RotationMatrix.MakeFromOneVector(z, 2) @ RotationMatrix.MakeZRotation(rng.uniform(0, 2 * np.pi))
-        found = chain_inverse(chain, RigidTransform(turn, p), near=joints[-1] if joints else None, seed=seed + tries)
+        near = joints[-1] if joints else 0.5 * (chain.position_lower + chain.position_upper)
+        found = nearest_solution(chain, RigidTransform(turn, p), near)
         if tries > 300:
             return arm_cell(seed + 100_000 * 7)
         if found is None:

@@ -23,7 +23,9 @@ from weldcal.calibration.eye_on_base.arm_start import (
     find_arm,
     start_from_arm,
 )
-from weldcal.models.arms.chain import chain_forward, known_chains, load_chain
+from weldcal.models.arms.chain import known_chains, load_chain
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.recorded import calibrate_dataset
 
@@ -78,7 +80,7 @@ def test_three_far_flanges_are_enough_beside_the_arm(tmp_path: Path) -> None:
 
 def test_without_joint_angles_a_franka_is_refused(tmp_path: Path) -> None:
     write_cell(cell(FAR), tmp_path / "cell", joints=False)
-    with pytest.raises((TooFewPoses, ValueError), match=r"usable poses|clouds can be used"):
+    with pytest.raises((TooFewPoses, InputError), match=r"usable poses|clouds can be used"):
         calibrate_dataset(tmp_path / "cell", tmp_path / "out")
 
 
@@ -128,7 +130,7 @@ def test_distances_from_capsules_are_those_of_their_points() -> None:
 def test_every_arm_has_capsules_at_its_flange(name: str) -> None:
     arm = load_chain(name)
     q = 0.5 * (arm.position_lower + arm.position_upper)
-    p = chain_forward(arm, q).translation()
+    p = forward_kinematics(arm, q).translation()
     assert abs(capsule_distance(np.array([p]), arm_shape(arm, q))[0][0]) < 0.06
 
 

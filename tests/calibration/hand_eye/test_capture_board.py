@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 import tests.calibration.hand_eye.rendering as draw
 from tests.calibration.hand_eye.test_pictures import BOARDS
-from weldcal.calibration.capture.session import ArmPose, Session
+from weldcal.calibration.capture.session import ArmPose, CaptureSession
 from weldcal.calibration.capture.tasks import BoardTask
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
 
@@ -22,7 +22,7 @@ TEXT = "chessboard:9x6:20"
 def test_the_camera_s_pose_and_what_to_do_next_after_each_picture(tmp_path: Path, mounting: str) -> None:
     drawing, rng = BOARDS[TEXT], np.random.default_rng(8)
     truth = draw.world(drawing, 8, 9, eye_in_hand=mounting == "eye_in_hand")
-    one = Session(tmp_path / "s", BoardTask(TEXT, mounting))
+    one = CaptureSession(tmp_path / "s", BoardTask(TEXT, mounting))
     seen = []
     for C, M in zip(truth.camera, truth.robot, strict=True):
         cv2.imwrite(str(tmp_path / "shot.png"), draw.render(drawing, C, rng, sub=2))
@@ -40,7 +40,7 @@ def test_the_camera_s_pose_and_what_to_do_next_after_each_picture(tmp_path: Path
     asked = HandEyeOptions(board=TEXT, mounting=mounting, corners=None)
     again = calibrate_recorded(one.folder, asked).result.X
     assert again.IsNearlyEqualTo(last.X, 1e-12), "as hand-eye gives it; OpenCV's threads add in another order"
-    resumed = Session(one.folder, BoardTask(TEXT, mounting))
+    resumed = CaptureSession(one.folder, BoardTask(TEXT, mounting))
     assert len(resumed.captures) == 9
     X_again = resumed.verdict().X
     assert X_again is not None

@@ -15,7 +15,8 @@ from weldcal.calibration.hand_eye.joints import JointRefinement, flange_poses, p
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeResult, solve_problem
-from weldcal.models.arms.chain import Chain, chain_forward, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import Chain, forward_kinematics
 from weldcal.models.errors import InputError
 
 TURN, SHIFT = np.radians(0.02), 1e-4
@@ -48,7 +49,7 @@ def test_the_chain_of_all_poses_is_the_arm_s_own() -> None:
     for name in ("ur5e", "franka_panda"):
         arm = load_chain(name)
         q = np.random.default_rng(1).uniform(-1.0, 1.0, (4, arm.n))
-        own = np.array([chain_forward(arm, each).GetAsMatrix4() for each in q])
+        own = np.array([forward_kinematics(arm, each).GetAsMatrix4() for each in q])
         np.testing.assert_allclose(flange_poses(arm, q, np.zeros((arm.n, 6))), own, atol=1e-12)
 
 

@@ -13,7 +13,8 @@ from weldcal.calibration.hand_eye.mountings import MOUNTINGS, TargetObservation,
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.planning.next_pose import next_pose, view_of
-from weldcal.models.arms.chain import chain_forward, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner
 
@@ -142,7 +143,7 @@ def test_the_next_pose_is_seen_by_the_camera_and_reached_by_the_arm() -> None:
     rng = np.random.default_rng(5)
     arm, scanner = load_chain("ur10e"), get_scanner("phoxi_s")
     q = np.array([0.3, -1.4, 1.7, -1.9, -1.5, 0.4]) + rng.uniform(-0.25, 0.25, (8, 6))
-    F = np.array([chain_forward(arm, each).GetAsMatrix4() for each in q])
+    F = np.array([forward_kinematics(arm, each).GetAsMatrix4() for each in q])
     X = random_poses(1, rng, 0.1, 0.02)[0]
     Y = F[0] @ X @ pose(np.eye(3), np.array([0.0, 0.0, scanner.optimum_m]))
     problem = full_problem(F, inverse(F @ X) @ Y @ noise(8, rng, TURN, SHIFT))
@@ -154,7 +155,7 @@ def test_the_next_pose_is_seen_by_the_camera_and_reached_by_the_arm() -> None:
     assert advice.X_BF is not None
     assert advice.q is not None
     np.testing.assert_allclose(
-        chain_forward(arm, advice.q).GetAsMatrix4(), np.asarray(advice.X_BF.GetAsMatrix4()), atol=1e-8
+        forward_kinematics(arm, advice.q).GetAsMatrix4(), np.asarray(advice.X_BF.GetAsMatrix4()), atol=1e-8
     )
     assert (advice.q >= arm.position_lower).all()
     assert (advice.q <= arm.position_upper).all()

@@ -16,9 +16,11 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
+from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
 from weldcal.calibration.verified_pairs import holds_scans
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import chain_poses
 from weldcal.models.arrays import Array
 from weldcal.tools.cli.app import app
 
@@ -203,8 +205,10 @@ def test_a_recording_at_rest_gives_the_camera(tmp_path: Path, robot: str, camera
     assert any("at rest, " in one for one in heard)
 
 
-def test_verify_and_import_read_the_same_recording(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "bag", run(), "tf", "aruco_ros")
+@pytest.mark.parametrize("moving", [False, True])
+def test_verify_and_import_read_the_same_recording(tmp_path: Path, moving: bool) -> None:
+    data = run(moving=moving, poses=24 if moving else 14)
+    path = recorded(tmp_path / "bag", data, "tf", "aruco_ros")
     assert not holds_scans(path)
     assert not holds_scans(next(path.glob("*.mcap")))
     for words in (
@@ -214,9 +218,24 @@ def test_verify_and_import_read_the_same_recording(tmp_path: Path) -> None:
         done = CliRunner().invoke(app, [*words, "--mounting", "eye_in_hand"])
         assert done.exit_code == 0, done.output
     with np.load(tmp_path / "y" / "pairs.npz") as pairs:
-        assert pairs["A"].shape == pairs["B"].shape == (14, 4, 4)
+        n = len(pairs["A"])
+        assert n > 50 if moving else n == 14
     found = CliRunner().invoke(app, ["verify", str(tmp_path / "x"), str(path)])
-    assert "The held-out error of 14 pairs" in " ".join(found.output.split())
+    assert f"The held-out error of {n} pairs" in " ".join(found.output.split())
+
+
+def test_a_recording_gives_the_flange_at_the_time_of_each_profile(tmp_path: Path) -> None:
+    data = run(poses=6)
+    path = recorded(tmp_path / "bag", data, "joints", "aruco_ros")
+    at = np.arange(12, len(data.t), 50)
+    rows = [f"{Bag.ns(data.t[k]) * 1e-9:.3f},{x},200" for k in at for x in range(3)]
+    (tmp_path / "export.csv").write_text("time [s],px_mm,pz_mm\n" + "\n".join(rows) + "\n")
+    with pytest.raises(DatasetError, match="joint angles and no poses"):
+        import_profiles(tmp_path / "export.csv", poses=path)
+    path = recorded(tmp_path / "tf", data, "tf", "aruco_ros")
+    for one in (path, next(path.glob("*.mcap"))):
+        found = import_profiles(tmp_path / "export.csv", poses=one)
+        np.testing.assert_allclose(found.readings[0].X, data.robot[at], atol=1e-6)
 
 
 def test_a_recording_without_rest_is_synchronised(tmp_path: Path) -> None:

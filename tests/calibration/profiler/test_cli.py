@@ -168,7 +168,7 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
         ),
         (("edge", "e.csv", "--as", "sigma-x=0"), "must be positive"),
         (("edge", "bad.csv"), "has the columns a, b: no x and z of profile points. Name them px_mm and pz_mm"),
-        (("edge", "word.csv"), "not a number"),
+        (("edge", "word.csv"), "holds no pose for any of the 1 profiles"),
         (("sphere", "e.csv"), "no 'profiles' of the sphere"),
         (("sphere", "e.csv", "--tip", "1,2"), "three numbers in mm"),
         (("seam", "e.csv", "--calibration", "nowhere"), "There is no calibration"),
@@ -183,7 +183,7 @@ def test_a_mistake_is_named_in_one_sentence_and_nothing_is_written(
     Path("t.txt").write_text("x")
     Path("broken.npz").write_text("x")
     Path("bad.csv").write_text("a,b\n1,2\n")
-    Path("word.csv").write_text("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad\n1,two,3,0,0,0\n")
+    Path("word.csv").write_text("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad,px_mm,pz_mm\n1,two,3,0,0,0,1,2\n")
     edge_csv(Path("e.csv"))
     level = [f"{k},{100 * k},0,500,1,0,0,0,{0.1 * j:.1f},200" for k in range(8) for j in range(60)]
     Path("flat.csv").write_text("scan,x_mm,y_mm,z_mm,qw,qx,qy,qz,px_mm,pz_mm\n" + "\n".join(level) + "\n")

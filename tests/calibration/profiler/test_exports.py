@@ -356,6 +356,16 @@ def test_profiles_pair_with_poses_by_number(tmp_path: Path) -> None:
     check_poses(read(tmp_path / "scancontrol_table.csv"))
 
 
+def test_a_profile_without_a_pose_of_its_number_is_named(tmp_path: Path) -> None:
+    w = world()
+    (tmp_path / "scancontrol_table.csv").write_text(scancontrol_table(w))
+    rows = quaternions(w).splitlines()
+    (tmp_path / "poses.csv").write_text("\n".join(["id," + rows[0], *(f"{k},{r}" for k, r in enumerate(rows[2:], 1))]))
+    found = import_profiles(tmp_path / "scancontrol_table.csv")
+    assert found.reading["robot"]["left_out"] == ["0 of scancontrol_table.csv: It has no partner."]
+    assert len(found.readings[0].X) == SCANS - 1
+
+
 def test_points_in_any_order_keep_their_poses(tmp_path: Path) -> None:
     rows = [f"{k},{100.0 * k},0,500,1,0,0,0,{k},{200 + k}" for k in (4, 2, 0, 3, 1)]
     (tmp_path / "a.csv").write_text("scan,x_mm,y_mm,z_mm,qw,qx,qy,qz,px_mm,pz_mm\n" + "\n".join(rows) + "\n")
@@ -396,7 +406,7 @@ def test_other_counts_of_poses_and_profiles_are_refused(tmp_path: Path) -> None:
     code, text, _ = run("sphere", tmp_path / "export.csv", "--radius", RADIUS)
     assert code == 1, text
     assert f"{SCANS - 3} poses" in text
-    assert f"{SCANS} profiles" in text
+    assert f"'export.csv' holds {SCANS};" in text
 
 
 def test_unnamed_columns_are_refused_with_an_example_that_works(tmp_path: Path) -> None:

@@ -67,10 +67,10 @@ def test_the_command_writes_the_result_with_its_clock() -> None:
     assert truth["error_mm"] < 0.6
     assert json.loads((folder / "run.json").read_text())["n_seen"] == said["n_seen"]
     written = load_result(folder)
-    assert outcome.estimate is not None
-    assert written.X_BC.IsNearlyEqualTo(outcome.estimate.X_BC, 1e-6)
+    assert outcome.report is not None
+    assert written.X_BC.IsNearlyEqualTo(outcome.report.estimate.X_BC, 1e-6)
     assert written.clock is not None
-    assert written.clock.offset_s == pytest.approx(outcome.estimate.clock.offset_s, abs=1e-6)
+    assert written.clock.offset_s == pytest.approx(outcome.report.estimate.clock.offset_s, abs=1e-6)
     shutil.rmtree(folder)
 
 
@@ -200,9 +200,7 @@ def test_what_streams_is_recorded(tmp_path: Path) -> None:
     builder.Connect(source.get_output_port(), recorder.GetInputPort("stream"))
     Simulator(builder.Build()).AdvanceTo(0.1)
     joints = posed_stream(run.cell.job.record(run.root), the_arm())
-    scanner = run.cell.scenario.scanner_config()
-    assert scanner is not None
-    assert recorder.finish(joints, "ur10e", "iso9409-1-50-4-m6", scanner.scanner()) == 1
+    assert recorder.finish(joints, run.cell.job.header) == 1
     read = load_motion_dataset(tmp_path / "recording")
     assert [(f.id, f.device) for f in read.frames] == [("00004", 7.0)]
     assert np.allclose(read.cloud("00004"), points, atol=1e-6)

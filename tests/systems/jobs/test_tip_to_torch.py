@@ -11,7 +11,6 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior, arm_errors
-from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm, with_link_transforms
 from weldcal.models.arrays import Array
@@ -103,7 +102,7 @@ def test_it_grows_with_the_curvature() -> None:
 def test_of_an_arm_whose_links_are_known_only_the_unseen_turn_of_the_flange_is_left() -> None:
     """The first joint moves tip and torch alike; the last one's zero, which no flange shows, turns the torch about the
     tip."""
-    which = arm_errors(chain_of(ARM), "links").which
+    which = arm_errors(ARM, "links").which
     size = 6 + len(which)  # X_BC first
     known = {"which": which.tolist(), "covariance": np.zeros((size, size)).tolist()}
     found = tip_to_torch(ARM, TOOL, STRAIGHT, Q_HOME, known)

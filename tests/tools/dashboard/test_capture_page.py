@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.browser import Browser
-from weldcal.calibration.capture.session import Session
+from weldcal.calibration.capture.session import CaptureSession
 from weldcal.calibration.capture.tasks import FlangeTask
 from weldcal.calibration.recorded_flange import calibrate_flange
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
@@ -33,7 +33,7 @@ def until(done: Callable[[], bool]) -> None:
 def run(tmp_path: Path) -> Iterator[CaptureRun]:
     cell = DemoCell(5)
     with closing(
-        CaptureRun(Session(tmp_path, FlangeTask(ROBOT, "ISO 9409-1-50-4-M6")), cell, cell, 0.1, "demo")
+        CaptureRun(CaptureSession(tmp_path, FlangeTask(ROBOT, "ISO 9409-1-50-4-M6")), cell, cell, 0.1, "demo")
     ) as one:
         yield one
 

@@ -14,14 +14,15 @@ from pydrake.math import RigidTransform
 
 from tests.browser import Browser
 from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.planning.calibration_poses import NextBest
 from weldcal.systems.jobs.motion.procedure import MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.procedure import HeldOutScan, MountingState, MountingStatus, NextBest
+from weldcal.systems.jobs.mounting.procedure import MountingState, MountingStatus
 from weldcal.systems.jobs.profiler.estimates import TakenProfile
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState, Touched
 from weldcal.systems.jobs.touch.planner import TouchPlace
 from weldcal.systems.jobs.touch.procedure import Felt, TouchState
-from weldcal.systems.messages import FlangeEstimate, JobCommand, Scan
+from weldcal.systems.messages import FlangeEstimate, JobCommand, Scan, VerificationResult
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.operator import Operator
 from weldcal.systems.phase_words import (
@@ -60,7 +61,7 @@ def drifted(moved: bool) -> DriftStatus:
 
 
 PROFILE = np.column_stack([np.linspace(-0.02, 0.02, 50), 0.08 + 0.001 * np.cos(np.arange(50))])
-BEST = NextBest(np.zeros(6), None, RigidTransform(), 2e-4, 1e-4)
+BEST = NextBest(np.zeros(6), RigidTransform(), 2e-4, 1e-4)
 PLACE = TouchPlace(np.zeros(6), np.zeros(3), np.zeros(3), 0.0, np.zeros(3), np.zeros(3))
 PROFILER = tuple((name, (key,)) for key, name in PROFILER_STEPS.items())
 JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
@@ -69,7 +70,7 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
         {
             "state": MountingState(phase="move", visit=11, purpose="verify", label="aside01"),
             "status": MountingStatus(
-                sequence=7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(HeldOutScan("aside01", 3e-4, 0.0),), next_best=BEST
+                sequence=7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(VerificationResult("aside01", 3e-4, 0.0),), next_best=BEST
             ),
         },
         "Verify",

@@ -27,6 +27,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.features.bead_course import bead_course
 from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.recorded_carried import CarriedCalibration
 from weldcal.calibration.recorded_hand_eye import MethodRow
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.calibration.verified_scans import PoseError
@@ -165,7 +166,7 @@ def motion() -> Made:
         seconds=1.0,
         out=OUT,
     )
-    return report.first, motion_report(report, dataset="moving")
+    return report.first, motion_report(report, "Calibration in motion of moving")
 
 
 def monitor() -> Made:
@@ -273,21 +274,27 @@ def _run(name: str, **job: Any) -> Any:
 def mounting() -> Made:
     """`hand-eye live`, without ground truth."""
     world = mounted_world("eye_in_hand", 0, scans=9)
-    result = solve_mounting(world.scene, world.seen, folds=5)
-    status = SimpleNamespace(
-        sequence=10,
-        seen=world.seen,
+    status = CarriedCalibration(
+        seen=tuple(world.seen),
         refused=(("pose3", "No circle."),),
+        result=solve_mounting(world.scene, world.seen, folds=5),
         sigma_work_m=2e-5,
         error_95_m=4e-5,
         history=((4, 4e-5), (9, 2e-5)),
-        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),),
-        next_best=None,
-        message="",
+        held_out=(VerificationResult("pose9", 1e-4, 1e-3),),
     )
-    run = _run("eye_in_hand", scene=world.scene, truth={}, status=lambda root: status)
+    run = _run("eye_in_hand", truth={})
     run.cell.station = SimpleNamespace(truth=SimpleNamespace(scanner=None))
-    report = MountingReport(run, result, OUT, 5.0)
+    report = MountingReport(
+        scene=world.scene,
+        status=status,
+        folder=OUT,
+        seconds=5.0,
+        limit=(run.cell.scenario.calibration.required_error_mm, "calibration.required_error_mm"),
+        description="A cell.",
+        source=("scenario.yaml", ""),
+        run=run,
+    )
     return report.first, mounting_report(report, None)
 
 

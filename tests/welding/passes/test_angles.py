@@ -240,7 +240,7 @@ def test_the_torch_stays_over_the_root_where_the_ball_sinks_less() -> None:
 @pytest.mark.parametrize("reverse", [False, True])
 def test_a_tip_that_is_not_used_is_lifted_for_a_push(reverse: bool) -> None:
     _, seam, root = setup()
-    order = WeldPass(travel_angle_rad=8.0 * DEG, angle_rad=5.0 * DEG, reverse=reverse)
+    order = WeldPass(travel_rad=8.0 * DEG, angle_rad=5.0 * DEG, reverse=reverse)
     config = pass_config(root, order, 2.5 * MM)
     line, config = lifted(seam, config)
     assert line.position(0.1)[2] - seam.position(0.1)[2] > 4.0 * MM
@@ -253,7 +253,7 @@ def test_a_tip_that_is_not_used_is_lifted_for_a_push(reverse: bool) -> None:
     wire = line.position(0.1) + config.clearance_m * line.up(0.1) + config.tool.side_offset_m * line.normal(0.1)
     assert wire == pytest.approx(seam.position(0.1) + root.clearance_m * seam.up(0.1), abs=3e-4)
     with pytest.raises(InfeasibleSeam, match="which is not used, would touch the part"):
-        lifted(seam, pass_config(root, replace(order, travel_angle_rad=-2.0 * DEG), 2.5 * MM))
+        lifted(seam, pass_config(root, replace(order, travel_rad=-2.0 * DEG), 2.5 * MM))
 
 
 @pytest.mark.parametrize("name", ["welding", "pipe"])

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.checks import cut_off, read_rows
+from weldcal.calibration.data.checks import cut_off
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.importing import import_profiles, profile_unit, profiles_of
@@ -19,10 +17,11 @@ from weldcal.calibration.profiler.reading_choice import Fit, choose_reading, fla
 from weldcal.models.array_files import AnyArray, read_npz
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, read_text, sha256
+from weldcal.models.text_tables import lines_of
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near
-LONGEST_TURN = 7.0  # rad: a whole turn and a little
+_OWN_FORM = "rotation_vector,rad"
 FAR_M = 20.0  # no robot's flange is this far from its base
 
 # other names of the same arrays, in files with one more axis for trials or worlds
@@ -165,14 +164,9 @@ def read_profiler_file(
             raise InputError("An NPZ holds its poses as T. Omit --poses and the keys robot-form and pitch of --as.")
         arrays, profiles = _from_npz(path, unit, dataset, trial)
         file = Measurements(arrays=arrays, profiles=profiles, digest=sha256(path))
-    elif stated == PosesStated() and _is_own_table(path):
-        arrays, profiles = _from_csv(path)
-        told = cut_off(path)
-        file = Measurements(
-            arrays=arrays, profiles=profiles, digest=sha256(path), warnings=() if told is None else (told,)
-        )
     elif posed:
-        file = _imported(path, unit, stated)
+        own = stated == PosesStated() and _is_own_table(path)
+        file = _imported(path, unit, replace(stated, form=_OWN_FORM) if own else stated)
     else:
         alone = profiles_of(path, stated.pitch_mm)[0]
         profiles = tuple(UNITS[profile_unit(alone, unit)] * p for p in alone.points)
@@ -183,15 +177,16 @@ def read_profiler_file(
         return file
     if X is None:
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")
+    cure = "Correct the file's entry 'unit' to" if path.suffix.lower() == ".npz" and unit is None else "Give --unit"
     if len(X) and float(np.abs(X.translation).max()) > FAR_M:
         raise InputError(
-            f"The flange would be {np.abs(X.translation).max():.0f} m from the base. Give --unit mm if the lengths are"
-            " in mm."
+            f"The flange would be {np.abs(X.translation).max():.0f} m from the base."
+            f" {cure} mm if the lengths are in mm."
         )
     if len(X) and float(np.abs(X.translation).max()) < NEAR_M:
         raise InputError(
-            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. Give --unit m if the"
-            " lengths are in m."
+            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base."
+            f" {cure} m if the lengths are in m."
         )
     return file
 
@@ -200,9 +195,7 @@ def _is_own_table(path: Path) -> bool:
     """Return whether a table is in this package's own form: a flange position and a rotation vector in every row."""
     if path.suffix.lower() != ".csv" or path.is_dir():
         return False
-    first = next(
-        (s for s in read_text(path).lstrip("\ufeff").splitlines() if s.strip() and not s.lstrip().startswith("#")), ""
-    )
+    _, first = next(lines_of(read_text(path), ("#",)), (0, ""))
     return {"rx_rad", "ry_rad", "rz_rad"} <= set(re.split(r"[\s,;]+", first.lower()))
 
 
@@ -215,7 +208,7 @@ def _imported(path: Path, unit: str | None, stated: PosesStated) -> Measurements
         arrays["points"] = np.vstack(found.profiles)
     if found.found is not None:
         arrays["points"] = found.found
-    told = cut_off(path) if found.single and path.suffix.lower() == ".csv" else None
+    told = cut_off(path) if path.suffix.lower() == ".csv" and path.is_file() else None
     return Measurements(
         arrays=arrays,
         profiles=None if found.single else found.profiles,
@@ -318,53 +311,3 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
     if not 0 <= trial < len(value):
         raise InputError(f"There is no trial {trial}. The file has 0 to {len(value) - 1}.")
     return np.asarray(value[trial])
-
-
-def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
-    """Read one row a profile point: the flange's x, y, z and rotation vector, the point, and the column `scan`."""
-    header, rows = read_rows(path)
-    if not rows:
-        raise InputError(f"'{path.name}' needs a header and a row of numbers for each profile point.")
-    unit = next((u for u in UNITS if f"x_{u}" in header), None)
-    wanted = [] if unit is None else [f"{v}_{unit}" for v in "xyz"] + ["rx_rad", "ry_rad", "rz_rad"]
-    if unit is None or not set(wanted) <= set(header):
-        raise InputError(
-            "The CSV's header needs x_mm, y_mm, z_mm (or _m) and rx_rad, ry_rad, rz_rad, the flange's rotation vector."
-        )
-
-    def columns(*names: str) -> Floats:
-        try:
-            found = np.array([[float(row[name] or "nan") for name in names] for row in rows])
-        except ValueError as e:
-            raise InputError(f"'{path.name}' has a cell that is not a number in {', '.join(names)}: {e}.") from e
-        if not float(np.nanmax(np.abs(found), initial=0.0)) <= LARGEST_NUMBER:
-            raise InputError(
-                f"'{path.name}' has a number in {', '.join(names)} that is infinite or beyond {LARGEST_NUMBER:g}."
-            )
-        return found
-
-    pose = columns(*wanted)
-    turn = float(np.nanmax(np.linalg.norm(pose[:, 3:], axis=1), initial=0.0))
-    if turn > LONGEST_TURN:
-        raise InputError(
-            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole"
-            " turn. They seem to be degrees; write radians."
-        )
-    seen = [f"px_{unit}", f"pz_{unit}"]
-    points: NDArray[np.float64] | None = None
-    if set(seen) <= set(header):
-        points = columns(*seen) * UNITS[unit]
-    first = np.arange(len(rows))
-    profiles = None
-    if "scan" in header:
-        scan = columns("scan")[:, 0]
-        _, first, of = np.unique(scan, return_index=True, return_inverse=True)
-        if points is not None:
-            profiles = tuple(points[of == k] for k in range(len(first)))
-    arrays = {
-        "rotation": Rotation.from_rotvec(pose[first, 3:]).as_matrix(),
-        "translation": pose[first, :3] * UNITS[unit],
-    }
-    if points is not None and len(first) == len(points):
-        arrays["points"] = points[first]
-    return arrays, profiles

@@ -25,6 +25,7 @@ from weldcal.calibration.profiler.sphere.joint import (
     sphere_joint,
 )
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools import console
@@ -159,7 +160,7 @@ def sphere_data(
     tip = tip_m if tip_m is not None else file.arrays.get("tip")
     if felt is not None and tip is None:
         raise InputError("There are touches but no tip. Give its position in the flange frame as --tip x,y,z in mm.")
-    table = DhArm.of(load_arm(arm)) if arm else file.arm()
+    table = DhArm(dh_parameters(load_arm(arm))) if arm else file.arm()
     poses = cast(FlangePoses, file.poses())
     check_number(poses, (len(file.profiles),), "profiles")
     profiles, kept = [], []

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import read_text
+from weldcal.models.text_tables import cells_of, lines_of
 
 Floats = npt.NDArray[np.float64]
 
@@ -56,12 +57,11 @@ def read_limits(path: Path) -> dict[str, tuple[float, float]]:
         InputError: naming the line that is at fault.
     """
     limits: dict[str, tuple[float, float]] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        cells = [cell.strip() for cell in line.split("#")[0].split(",")]
-        if cells == [""] or (not limits and cells[0] == "quantity"):
+    for number, line in lines_of(read_text(path), ("#",)):
+        if not limits and line.startswith("quantity"):
             continue
         try:
-            name, unit, *ends = cells
+            name, unit, *ends = cells_of(line.split("#")[0], ",")
             least, most = (float(end) if end else off for end, off in zip(ends, (-math.inf, math.inf), strict=True))
             if unit != FIT_UP[name][0] or not least <= most:
                 raise ValueError

@@ -13,18 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse
+from weldcal.models.arms.inverse import continued_solution
+from weldcal.models.arms.kinematics import ArmModel, chain_poses, kinematics_and_jacobian
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.emulators.ur.controller.motions import (
-    REST_RAD_S,
-    STEP_S,
-    ControllerMotion,
-    MotionRefused,
-    newton,
-    slowed,
-)
-from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, rotation_matrix, rotation_vector
+from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, ControllerMotion, MotionRefused, slowed
+from weldcal.tools.emulators.ur.controller.poses import matrix, rotation_vector
 
 # [M] N s/m and N m s/rad
 DAMPING = np.array([500.0] * 3 + [50.0] * 3)
@@ -86,13 +81,10 @@ class Compliance:
         asked = np.clip(asked, -self.task.limits, self.task.limits) if live else np.zeros(6)
         self._speed += np.clip(asked - self._speed, -ACCELERATION * STEP_S, ACCELERATION * STEP_S)
         self._moved = self._moved + axes @ self._speed[:3] * STEP_S
-        self._turned = rotation_matrix(axes @ self._speed[3:] * STEP_S) @ self._turned
-        R, p, _ = kinematics_and_jacobian(model, nominal.q_target)
-        X = np.eye(4)
-        X[:3, :3], X[:3, 3] = R, p
-        X = X @ X_FT
+        self._turned = exp_rotation(axes @ self._speed[3:] * STEP_S) @ self._turned
+        X = chain_poses(model, nominal.q_target) @ X_FT
         X[:3, :3], X[:3, 3] = self._turned @ X[:3, :3], X[:3, 3] + self._moved
-        found = newton(model, X @ inverse(X_FT), q)
+        found = continued_solution(model, as_transform(X @ inverse(X_FT)), q)
         if found is None:
             raise MotionRefused("force mode leaves the arm's reach")
         return np.asarray((found - q) / STEP_S, dtype=np.float64)
@@ -295,10 +287,7 @@ class EmulatedArm:
 
     def flange(self, q: Array) -> Array:
         """X_BF (4, 4) at q."""
-        R, p, _ = kinematics_and_jacobian(self.model, q)
-        X = np.eye(4)
-        X[:3, :3], X[:3, 3] = R, p
-        return X
+        return chain_poses(self.model, q)
 
     def flange_goal(self, pose: list[float]) -> Array:
         """X_BF (4, 4) that puts the tool at `pose`."""

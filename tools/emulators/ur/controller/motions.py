@@ -10,9 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse
+from weldcal.models.arms.inverse import continued_solution
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.models.arrays import Array
-from weldcal.tools.emulators.ur.controller.poses import inverse, pose_error, rotation_matrix, rotation_vector
+from weldcal.tools.emulators.ur.controller.poses import rotation_vector
 
 STEP_S = 0.002
 # [M] where speedl gives up: smallest singular value of the tool's Jacobian (m and rad as they are)
@@ -229,21 +231,6 @@ def joint_velocity(arm: ArmState, twist: Array) -> Array:
     return np.asarray(np.linalg.solve(J, twist), dtype=np.float64)
 
 
-def newton(model: ArmModel, X_goal: Array, q_near: Array, steps: int = 12) -> Array | None:
-    """Joint angles near q_near that put the flange at X_goal (4, 4) within 1e-9 m and rad, or None."""
-    q = np.array(q_near, dtype=np.float64)
-    for _ in range(steps):
-        R, p, J = kinematics_and_jacobian(model, q)
-        error = pose_error(X_goal, R, p)
-        if float(np.abs(error).max()) < 1e-10:
-            return q
-        # a little damping keeps the step finite at a singularity
-        change = J.T @ np.linalg.solve(J @ J.T + 1e-10 * np.eye(6), error)
-        largest = float(np.abs(change).max())
-        q += change if largest < 0.3 else change * (0.3 / largest)
-    return None
-
-
 NOTHING = 1e-9  # a path shorter than this (m or rad) is none
 TURNED_ONLY_M = 1e-6
 
@@ -273,7 +260,7 @@ def tool_path(
 
     def pose(s: float) -> Array:
         X = np.eye(4)
-        X[:3, :3] = rotation_matrix(turn * (s / length)) @ X_from[:3, :3]
+        X[:3, :3] = exp_rotation(turn * (s / length)) @ X_from[:3, :3]
         X[:3, 3] = X_from[:3, 3] + step * (s / length)
         return X
 
@@ -315,7 +302,7 @@ def arc_path(
     def pose(s: float) -> Array:
         share = s / length
         X = np.eye(4)
-        X[:3, :3] = rotation_matrix(turn * share) @ X_from[:3, :3]
+        X[:3, :3] = exp_rotation(turn * share) @ X_from[:3, :3]
         X[:3, 3] = centre + radius * (np.cos(angle * share) * x + np.sin(angle * share) * y)
         return X
 
@@ -334,7 +321,7 @@ def _path(
     X_TF = inverse(X_FT)
 
     def joints(s: float, q_near: Array) -> Array:
-        q = newton(model, pose(s) @ X_TF, q_near)
+        q = continued_solution(model, as_transform(pose(s) @ X_TF), q_near)
         if q is None:
             raise MotionRefused(f"{what} leaves the arm's reach")
         return q

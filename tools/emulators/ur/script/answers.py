@@ -5,15 +5,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.inverse import nearest_solution
+from weldcal.calibration.geometry.se3 import as_transform, exp_rotation, inverse
+from weldcal.models.arms.inverse import continued_solution, nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
-from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
-from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of, rotation_matrix, rotation_vector
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.poses import matrix, pose_of, rotation_vector
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.arithmetic import Effort, Pose
@@ -82,9 +83,7 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
     "rpy2rotvec": lambda rpy_vector: rotation_vector(RollPitchYaw(rpy_vector).ToRotationMatrix().matrix()).tolist(),
-    "rotvec2rpy": lambda rotation_vector: (
-        RollPitchYaw(RotationMatrix(rotation_matrix(rotation_vector))).vector().tolist()
-    ),
+    "rotvec2rpy": lambda rotation_vector: RollPitchYaw(RotationMatrix(exp_rotation(rotation_vector))).vector().tolist(),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
     "log": lambda b, f: math.log(f, b),
@@ -158,14 +157,13 @@ class Answers:
     def _inverse(self, pose: Any, q_near: Any) -> Array | None:
         arm = self._controller.arm
         Effort.spend(SLOW)
-        X = arm.flange_goal(six(pose, "A pose").tolist())
+        X = as_transform(arm.flange_goal(six(pose, "A pose").tolist()))
         near = arm.q_target if q_near is None else six(q_near, "qnear")
-        found = newton(arm.model, X, near)
+        found = continued_solution(arm.model, X, near)
         if found is not None and float(np.abs(found - near).max()) < 1.0 and _inside(arm.model, found):
             return found
         try:
-            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])
-            return nearest_solution(arm.model, RigidTransform(R, X[:3, 3]), near)
+            return nearest_solution(arm.model, X, near)
         except InputError as error:
             raise ScriptError(str(error)) from error
 
@@ -200,7 +198,7 @@ class Answers:
         X, Y = matrix(six(p_from, "interpolate_pose")), matrix(six(p_to, "interpolate_pose"))
         turn = rotation_vector(Y[:3, :3] @ X[:3, :3].T)
         X[:3, 3] += alpha * (Y[:3, 3] - X[:3, 3])
-        X[:3, :3] = rotation_matrix(alpha * turn) @ X[:3, :3]
+        X[:3, :3] = exp_rotation(alpha * turn) @ X[:3, :3]
         return Pose(pose_of(X))
 
     def is_within_safety_limits(self, pose: Any) -> bool:

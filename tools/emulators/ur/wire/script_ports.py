@@ -3,10 +3,10 @@
 import struct
 from collections.abc import Callable
 
+from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.poses import dh_parameters
 from weldcal.tools.emulators.ur.controller.registers import (
     OPERATIONAL_MODES,
     ErrorCode,
@@ -220,21 +220,20 @@ def kinematics_info(model: ArmModel) -> bytes:
 
     Six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated.
     """
-    dh = dh_parameters(model)
-    numbers = [*dh.theta, *dh.a, *dh.d, *dh.alpha]
-    packed = struct.pack(">24d", *numbers)
+    a, alpha, d, theta = dh_parameters(model).T
+    packed = struct.pack(">24d", *theta, *a, *d, *alpha)
     checksums = [sum(packed[joint * 8 :: 48]) & 0xFFFFFFFF for joint in range(6)]
     status = NOMINAL if model.calibration is None else CALIBRATED
     return struct.pack(">6I", *checksums) + packed + struct.pack(">I", status)
 
 
 def _configuration(model: ArmModel) -> bytes:
-    dh, robot_type = dh_parameters(model), CONTROLLER_MODELS[model.name][1]
+    (a, alpha, d, theta), robot_type = dh_parameters(model).T, CONTROLLER_MODELS[model.name][1]
     limits = [v for pair in zip(model.position_lower, model.position_upper, strict=True) for v in pair]
     speeds = [v for pair in zip(model.velocity_limit, model.acceleration_limit, strict=True) for v in pair]
     defaults = [1.05, 1.4, 0.25, 1.2, 0.35]
     body = struct.pack(">29d", *limits, *speeds, *defaults)
-    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, robot_type, 0)
+    return body + struct.pack(">24d4i", *a, *d, *alpha, *theta, 1, 2, robot_type, 0)
 
 
 def message_body(event: Event) -> tuple[int, bytes]:
