@@ -19,7 +19,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict, estimate_jointly, left_uncorrected, solve_jointly
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges, require_flange
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, FlangeScan, fit_flanges, require_flange
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import disagreeing, estimate_result
 from weldcal.calibration.eye_on_base.validation import Convergence, convergence, k_fold, sampling_advice
@@ -139,11 +139,12 @@ def calibrate_flange(
     asked: FlangeOptions | None = None,
     tell: Tell = lambda step, fraction: None,
     examine: Examine = lambda problem, case: None,
+    known: dict[str, FlangeScan] | None = None,
 ) -> RecordedFlange:
     """Calibrate from a dataset folder.
 
     A cloud that cannot be used is refused and reported, as long as enough remain. Where five scans or more contradict
-    each other, ``examine`` gets the refusal and the case before it is raised.
+    each other, ``examine`` gets the refusal and the case before it is raised. ``known``: see fit_flanges.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
@@ -151,7 +152,7 @@ def calibrate_flange(
     asked = asked or FlangeOptions()
     if asked.refine is not None and asked.refine not in REFINEMENTS:
         raise InputError(f"There is no refinement '{asked.refine}'. Choose one of {', '.join(REFINEMENTS)}.")
-    scans = _find_flanges(folder, asked, tell)
+    scans = _find_flanges(folder, asked, tell, known)
     measured = scans.seen.observations
     found, agreement = _solve(scans, tell, examine)
     inliers = found.inliers(measured)
@@ -180,14 +181,16 @@ def calibrate_flange(
     )
 
 
-def _find_flanges(folder: Path, asked: FlangeOptions, tell: Tell) -> _Scans:
+def _find_flanges(folder: Path, asked: FlangeOptions, tell: Tell, known: dict[str, FlangeScan] | None) -> _Scans:
     """Read the dataset and fit the flange in each scan; with too few, start from the visible arm."""
     require_flange(folder, asked.flange, asked.robot)
     data = load_dataset(folder, robot=asked.robot or "")
     if asked.poses is not None:
         data = data.between(asked.poses)
     robot, standard = asked.robot or data.header.robot, get_flange(asked.flange or data.header.flange)
-    seen = fit_flanges(data, standard, seed=asked.seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    seen = fit_flanges(
+        data, standard, seed=asked.seed, tell=lambda part: tell("fitting flanges", 0.7 * part), known=known
+    )
     start: ArmStart | None = None
     if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
         tell("comparing the visible arm", 0.7)

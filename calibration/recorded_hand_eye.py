@@ -24,6 +24,7 @@ from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, 
 from weldcal.calibration.hand_eye.pairs.files import NO_MOUNTING, PosePairs, read_pairs, recorded_lists
 from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
+from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
@@ -127,8 +128,10 @@ class _Solution:
     adopted: bool = False
 
 
-def calibrate_recorded(file: Path, asked: HandEyeOptions, say: Say = lambda _: None) -> RecordedHandEye:
-    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved.
+def calibrate_recorded(
+    file: Path, asked: HandEyeOptions, say: Say = lambda _: None, known: dict[str, Picture] | None = None
+) -> RecordedHandEye:
+    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved; ``known``: see find_in.
 
     Raises:
         InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
@@ -137,7 +140,7 @@ def calibrate_recorded(file: Path, asked: HandEyeOptions, say: Say = lambda _: N
     asked = asked.checked()
     arm = None if asked.robot is None else load_chain(asked.robot, asked.kinematics)
     scanner = None if asked.camera is None else get_scanner(asked.camera)
-    pairs, streams, shots = _read(file, asked)
+    pairs, streams, shots = _read(file, asked, known)
     for sentence in [*([] if streams is None else [streams.sentence]), *understood(pairs)]:
         say(sentence)
     mounting = get_mounting(pairs.mode)
@@ -178,12 +181,16 @@ def calibrate_recorded(file: Path, asked: HandEyeOptions, say: Say = lambda _: N
     )
 
 
-def _read(file: Path, asked: HandEyeOptions) -> tuple[PosePairs, ClockOffset | None, PictureSet | None]:
+def _read(
+    file: Path, asked: HandEyeOptions, known: dict[str, Picture] | None
+) -> tuple[PosePairs, ClockOffset | None, PictureSet | None]:
     """Return the pairs of pictures, streams or a file of pairs or motions."""
     mounting, unit, stated = asked.mounting, asked.unit, asked.stated
     if asked.board is not None:
         board = parse_board(asked.board)
-        shots = read_pictures(file, board, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics)
+        shots = read_pictures(
+            file, board, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics, known=known
+        )
         return shots.pairs, None, shots
     if asked.motions:
         return read_pairs(file, mounting=mounting, length=unit, stated=replace(stated, decide=False)), None, None

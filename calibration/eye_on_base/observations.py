@@ -45,6 +45,10 @@ _STEPS = 4
 _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error is searched for in the whole scan
 
 
+FlangeScan = tuple[FlangeFit, HolePattern | None, Array] | CloudError | FlangeNotFound
+"""The flange in a cloud, its holes, and the points of its face; or why it is not there."""
+
+
 @dataclass(frozen=True, eq=False)
 class FlangeObservations:
     """Results of the flange fits.
@@ -73,6 +77,23 @@ def require_flange(folder: Path, flange: str | None, robot: str | None = None) -
         stated_flange(flange or header.flange, robot or header.robot)
 
 
+def flange_scan(
+    points: Array,
+    standard: FlangeStandard,
+    guess: FlangeGuess | None = None,
+    seed: int = 0,
+    *,
+    whole: bool = False,
+    holes: bool = True,
+) -> FlangeScan:
+    """Find the flange in a cloud (N, 3) or (H, W, 3), m; ``whole``: a guess that leads nowhere is not the end."""
+    try:
+        fit = _fit(points, standard, guess, seed, whole=whole)
+    except FlangeNotFound as refusal:
+        return refusal
+    return fit, find_holes(points, fit, standard) if holes else None, face_cloud(points, fit, standard)
+
+
 def fit_flanges(
     data: Dataset,
     standard: FlangeStandard,
@@ -82,13 +103,14 @@ def fit_flanges(
     holes: bool = True,
     seed: int = 0,
     tell: Callable[[float], None] = lambda fraction: None,
+    known: dict[str, FlangeScan] | None = None,
 ) -> FlangeObservations:
     """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole.
     ``guesses`` says it scan by scan instead. Without ``holes`` no hole pattern is looked for. Deterministic for
     ``seed``. ``tell`` is told the fraction done. A damaged file is refused with its reason, as is a scan that shows no
-    flange.
+    flange. ``known`` holds what was found in clouds before, by id, and takes what is found now.
     """
     if data.pairs:
         return FlangeObservations(
@@ -100,14 +122,19 @@ def fit_flanges(
     clouds: dict[str, Array] = {}
     refused = list(data.refused)
 
-    def measured(id: str) -> tuple[FlangeFit, HolePattern | None, Array] | CloudError | FlangeNotFound:
+    known = {} if known is None else known
+
+    def measured(id: str) -> FlangeScan:
+        if id not in known:
+            known[id] = fitted(id)
+        return known[id]
+
+    def fitted(id: str) -> FlangeScan:
         try:
-            points = data.cloud(id)
             guess = _guess(data, id, standard, X_BC) if guesses is None else guesses[id]
-            fit = _fit(points, standard, guess, seed, whole=X_BC is not None)
-        except (CloudError, FlangeNotFound) as refusal:
+            return flange_scan(data.cloud(id), standard, guess, seed, whole=X_BC is not None, holes=holes)
+        except CloudError as refusal:
             return refusal
-        return fit, find_holes(points, fit, standard) if holes else None, face_cloud(points, fit, standard)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and fitting leave the interpreter most of the time
         for k, (id, found) in enumerate(zip(data.clouds, pool.map(measured, data.clouds), strict=True)):

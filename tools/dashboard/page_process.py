@@ -35,12 +35,16 @@ _PAGE = Path(__file__).parent / "page"
 
 @dataclass(frozen=True)
 class PageSetup:
-    """What the process starts with: listening socket, key of the buttons or None, token of the address or None."""
+    """What the process starts with: listening socket, key of the buttons or None, token of the address or None.
+
+    ``page``: name of its files in the folder of the pages.
+    """
 
     listener: socket.socket
     view_url: str | None
     key: str | None
     token: str | None
+    page: str = "dashboard"
 
 
 class _Handler(WSGIRequestHandler):
@@ -138,15 +142,16 @@ class _Page:
 
         @app.get(f"{root}/")
         def page() -> str:
-            return render_template("dashboard.html", view_url=view_url, key=key or "")
+            return render_template(f"{self._setup.page}.html", view_url=view_url, key=key or "")
 
         @app.get(f"{root}/dashboard.css")
         def style() -> Response:
-            return Response((_PAGE / "dashboard.css").read_text(), mimetype="text/css")
+            names = dict.fromkeys(("dashboard.css", f"{self._setup.page}.css"))
+            return Response("".join((_PAGE / name).read_text() for name in names), mimetype="text/css")
 
         @app.get(f"{root}/dashboard.js")
         def script() -> Response:
-            return Response((_PAGE / "dashboard.js").read_text(), mimetype="text/javascript")
+            return Response((_PAGE / f"{self._setup.page}.js").read_text(), mimetype="text/javascript")
 
         @app.get(f"{root}/picture/<int:number>")
         def picture(number: int) -> Response:
@@ -184,8 +189,8 @@ class _Page:
                     abort(403)
                 asked = request.get_json(silent=True)
                 value = asked.get("value") if isinstance(asked, dict) else None
-                number = float(value) if isinstance(value, int | float) else None
-                return jsonify({"done": self._ask("act", what, number)})
+                value = float(value) if isinstance(value, int | float) else value if isinstance(value, str) else None
+                return jsonify({"done": self._ask("act", what, value)})
 
         return app
 

@@ -8,16 +8,34 @@ import threading
 from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from weldcal.systems.interrupts import deferred
 from weldcal.tools.connections import BACKLOG, network_address
 from weldcal.tools.dashboard.page_process import FILES_S, LAST_WORDS_S, LOOPBACK, PageSetup, serve_page
-from weldcal.tools.dashboard.source import DashboardSource
 
 ANYWHERE = "0.0.0.0"
 PORTS = range(7580, 7600)  # the first free one, so that a page that is open finds the next run
 END_S = FILES_S + LAST_WORDS_S + 1.0
+
+
+class PageSource(Protocol):
+    """What a page shows, and what its buttons do; the methods are called from the server's threads."""
+
+    files: dict[str, Path]
+
+    def values(self) -> dict[str, Any]:
+        """Return all present values of the page."""
+
+    def rows(self, weld: int, scans: int) -> dict[str, Any]:
+        """Return the rows of the plots from these numbers on."""
+
+    def act(self, what: str, value: Any = None) -> bool:
+        """Do what a button asks; False where there is no such button."""
+
+    def picture(self) -> bytes | None:
+        """Return the newest picture as a PNG, or None."""
 
 
 class Dashboard:
@@ -29,8 +47,8 @@ class Dashboard:
     the run answers one question of a page at a time.
     """
 
-    def __init__(self, source: DashboardSource, view_url: str, share: bool = False) -> None:
-        self.source = source
+    def __init__(self, source: PageSource, view_url: str | None, share: bool = False, page: str = "dashboard") -> None:
+        self.source, self._page = source, page
         self._over = threading.Event()
         self._processes: list[Any] = []
         self.url = f"http://{LOOPBACK}:{self._start(LOOPBACK, view_url, secrets.token_urlsafe(24), None)}/"
@@ -55,7 +73,7 @@ class Dashboard:
             ours, its = context.Pipe()
             with deferred():
                 process = context.Process(
-                    target=serve_page, args=(its, PageSetup(listener, view_url, key, token)), daemon=True
+                    target=serve_page, args=(its, PageSetup(listener, view_url, key, token, self._page)), daemon=True
                 )
                 process.start()
                 self._processes.append(process)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.config import WristPicture
 from weldcal.systems.messages import FlangeEstimate, Scan
@@ -56,18 +57,31 @@ def picture_png(moment: Moment) -> bytes | None:
     scan, picture = moment.shown.get("scan"), moment.shown.get("picture")
     if isinstance(scan, Scan) and scan.points_C.size:
         estimate = moment.shown.get("flange_estimate")
-        shown = depth_picture(scan, estimate if isinstance(estimate, FlangeEstimate) else None)
+        fit = estimate.fit if isinstance(estimate, FlangeEstimate) and estimate.sequence == scan.sequence else None
+        shown = depth_picture(np.asarray(scan.points_C, dtype=float), fit)
     elif isinstance(picture, WristPicture) and picture.sequence:
         shown = _small(picture.grey)
     else:
         return None
+    return png(shown)
+
+
+def png(shown: NDArray[np.uint8]) -> bytes:
+    """Return a picture as the bytes of a PNG file."""
     return bytes(cv2.imencode(".png", shown)[1].tobytes())
 
 
-def depth_picture(scan: Scan, estimate: FlangeEstimate | None) -> NDArray[np.uint8]:
-    """Return a depth picture (h, WIDTH_PX, 3) BGR, near bright; around a flange that was found in this scan a ring."""
-    step = max(1, scan.points_C.shape[1] // WIDTH_PX)
-    points = scan.points_C[::step, ::step]
+def depth_picture(points_C: Array, fit: FlangeFit | None) -> NDArray[np.uint8]:
+    """Return the depths of a scan as a picture (h, WIDTH_PX, 3) BGR, near bright; around a flange in it a ring.
+
+    Args:
+        points_C: (H, W, 3) m; an unordered cloud (N, 3) is shown as its own directions lie.
+        fit: the flange that was found in it.
+    """
+    if points_C.ndim == 2:
+        points_C = _in_grid(points_C)
+    step = max(1, points_C.shape[1] // WIDTH_PX)
+    points = points_C[::step, ::step]
     z = points[:, :, 2]
     seen = np.isfinite(z)
     grey = np.zeros(z.shape, dtype=np.uint8)
@@ -79,12 +93,24 @@ def depth_picture(scan: Scan, estimate: FlangeEstimate | None) -> NDArray[np.uin
     scale = WIDTH_PX / shown.shape[1]
     size = (WIDTH_PX, max(1, round(shown.shape[0] * scale)))
     shown = np.asarray(cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-    fit = None if estimate is None or estimate.sequence != scan.sequence else estimate.fit
     if fit is not None and fit.outer_radius_m is not None:
         at = _pixels_of(np.asarray(points, dtype=float), _ring(fit.center_C, fit.normal_C, fit.outer_radius_m))
         if at is not None:
             cv2.polylines(shown, [(scale * at).round().astype(np.int32)], True, _FOUND, 2, cv2.LINE_AA)
     return np.asarray(shown, dtype=np.uint8)
+
+
+def _in_grid(points: Array) -> Array:
+    """Points (n, 3) as a picture (h, WIDTH_PX, 3) by their own directions; NaN where none is."""
+    p = points[np.isfinite(points[:, 2]) & (points[:, 2] > 0.0)]
+    uv = p[:, :2] / p[:, 2:]
+    low, size = np.percentile(uv, 1.0, axis=0), np.ptp(np.percentile(uv, [1.0, 99.0], axis=0), axis=0)
+    shape = max(1, round(WIDTH_PX * float(size[1] / size[0]))), WIDTH_PX
+    at = ((uv - low) / size * [shape[1] - 1, shape[0] - 1]).round().astype(int)
+    inside = ((at >= 0) & (at < [shape[1], shape[0]])).all(axis=1)
+    grid = np.full((*shape, 3), np.nan)
+    grid[at[inside, 1], at[inside, 0]] = p[inside]
+    return grid
 
 
 def _ring(center: Array, normal: Array, radius_m: float) -> Array:

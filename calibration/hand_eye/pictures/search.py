@@ -156,8 +156,12 @@ def load_grey(path: Path) -> NDArray[np.uint8] | None:
     return np.asarray(image, dtype=np.uint8)
 
 
-def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, list[Picture]]:
+def find_in(
+    files: Sequence[Path], board: Board, source: str, known: dict[str, Picture] | None = None
+) -> tuple[Board, list[Picture]]:
     """Return the board in every picture, on two threads.
+
+    ``known`` holds the pictures that were searched before, by name, and takes what is found now.
 
     Raises:
         DatasetError: it is in fewer than four; the sentence says what was found in its place.
@@ -190,8 +194,12 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
             name=path.name, points=points, size=grey.shape[::-1], thumbnail=_thumbnail(grey, points), why=why
         )
 
+    known = (
+        {} if known is None or board.kind in ("circles", "acircles") else known
+    )  # of circles the radius is found anew
     with ThreadPoolExecutor(max_workers=2) as pool:
-        pictures = list(pool.map(one, files))
+        known |= {p.name: p for p in pool.map(one, [path for path in files if path.name not in known])}
+    pictures = [known[path.name] for path in files]
     if np.isfinite(radii).any():
         board = replace(board, radius=float(np.nanmedian(radii)))
     n = sum(not p.why for p in pictures)

@@ -66,6 +66,7 @@ def read_pictures(
     unit: str | None = None,
     stated: StatedForms | None = None,
     camera: Path | None = None,
+    known: dict[str, Picture] | None = None,
 ) -> PictureSet:
     """Return the pictures of a folder with the robot's poses.
 
@@ -77,6 +78,7 @@ def read_pictures(
         unit: of the robot's positions.
         stated: what the user states of the robot's poses.
         camera: a file that states the camera; without it one of the folder is taken, or the camera is estimated.
+        known: see find_in.
 
     Raises:
         DatasetError: pictures, poses or camera cannot be used; InconsistentPoses: they contradict each other.
@@ -98,7 +100,7 @@ def read_pictures(
     stated_camera = (camera, read_camera(camera)) if camera is not None else camera_in(folder)
     skip = frozenset() if stated_camera is None else frozenset({stated_camera[0]})
     robot = _robot(folder, stated, skip, unit)
-    board, pictures = find_in(files, board, folder.name)
+    board, pictures = find_in(files, board, folder.name, known)
     return picture_set(pictures, board, robot, mode, folder.name, stated=stated, camera=stated_camera, named=camera)
 
 

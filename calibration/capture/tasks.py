@@ -1,0 +1,299 @@
+"""What is captured by hand: scans of the flange, or pictures of a board; each looks at one and calibrates from all."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_dump
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial import cKDTree
+
+from weldcal.calibration.capture.session import (
+    LEAST,
+    POSES_FILE,
+    RESULT,
+    Advice,
+    ArmPose,
+    Capture,
+    CaptureTask,
+    CaptureVerdict,
+    jog,
+)
+from weldcal.calibration.data.checks import AUTO, to_metres
+from weldcal.calibration.data.clouds import CloudError, read_cloud
+from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.results import export_all, save_result
+from weldcal.calibration.eye_on_base.estimate import point_error_covariance
+from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
+from weldcal.calibration.eye_on_base.observations import FlangeScan, fit_flanges, flange_scan
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.robust import radius_95
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
+from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
+from weldcal.calibration.planning.calibration_poses import predicted_sigma
+from weldcal.calibration.recorded_flange import calibrate_flange
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
+from weldcal.calibration.verified_scans import verify_scans
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.files import write_atomic
+from weldcal.models.robots import stated_flange
+
+_APART_M, _APART = 0.01, 0.05  # a choice: centres in two frames differ by less, also with a wrong scale or a small TCP
+_CLEARLY_M = 0.02  # a choice: of the arm, which a camera at 3 m would show by several pixels
+_EDGE_SEEN = 0.6  # a choice: share of the flange's edge; less leaves its centre open across the missing part
+_SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures have 2 to 3, soft large ones 5
+_SMALL_PX = 8.0  # a choice: between neighbours of a board; a corner is found to a twentieth of it at best
+_TRIED = 200  # a choice: the best of 400 is 2 % better
+_WIDER, _ASIDE = 1.15, 0.1  # a choice: how far beyond the places so far the next one may lie; at least so far aside
+_TILT_RAD = np.radians(30.0)  # paper, section 2.1.4: the largest angle of the face to the line of sight
+HOME_Q = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
+"""Joint angles of a Universal Robots arm near which the next pose is sought where none are known."""
+
+
+class FlangeTask:
+    """Scans of the flange by a scanner beside the robot; the folder is that of `weldcal calibrate`."""
+
+    symbol, folder = "X_BC", "clouds"
+
+    def __init__(self, robot: str, flange: str) -> None:
+        self._standard = stated_flange(flange, robot)
+        self._robot, self._known = robot, dict[str, FlangeScan]()
+        self._X_BC: RigidTransform | None = None
+
+    def prepare(self, folder: Path) -> None:
+        """See CaptureTask."""
+        document = {"schema": 1, "configuration": "eye_on_base", "flange": self._standard.designation}
+        document |= {"units": {"clouds": "auto", "poses": "auto"}, "poses": {"file": POSES_FILE}}
+        write_atomic(folder / "dataset.yaml", yaml_dump(document | ({"robot": self._robot} if self._robot else {})))
+
+    def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
+        """See CaptureTask."""
+        try:
+            points = to_metres(read_cloud(path).astype(float), AUTO, path.name)
+        except CloudError as refusal:
+            return None, refusal.reason
+        found = self._known[id] = flange_scan(points, self._standard)
+        if not isinstance(found, tuple):
+            return None, found.reason
+        fit = found[0]
+        if fit.coverage < _EDGE_SEEN:
+            return fit, (
+                f"Only {100 * fit.coverage:.0f} % of the flange's edge is in the scan: bring it whole into the"
+                " scanner's view, with nothing before it."
+            )
+        return fit, ""
+
+    def contradicts(self, one: Capture, other: Capture) -> str:
+        """See CaptureTask."""
+        a, b = one.pose.X_BF, other.pose.X_BF
+        if a is None or b is None or not isinstance(one.found, FlangeFit) or not isinstance(other.found, FlangeFit):
+            return ""
+        robot = float(np.linalg.norm(a.translation() - b.translation()))
+        shown = float(np.linalg.norm(one.found.center_C - other.found.center_C))
+        if abs(robot - shown) < _APART_M + _APART * max(robot, shown):
+            return ""
+        return (
+            f"Since {one.id} the flange moved by {1e3 * robot:.0f} mm at the robot and by {1e3 * shown:.0f} mm in the"
+            " scans: the pose or the scan is an older one, the pose is not in its unit, or it is not the flange's (a"
+            " TCP is set at the robot)."
+        )
+
+    def forget(self, id: str) -> None:
+        """See CaptureTask."""
+        self._known.pop(id, None)
+
+    def fresh(self) -> CaptureTask:
+        """See CaptureTask."""
+        return FlangeTask(self._robot, self._standard.designation)
+
+    def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
+        """See CaptureTask."""
+        try:
+            found = calibrate_flange(folder, known=self._known)
+        except WeldcalError as refusal:
+            data = load_dataset(folder, robot=self._robot)
+            seen = fit_flanges(data, self._standard, known=self._known)
+            with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
+                X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
+                advice = self._next(seen.observations, seen.data or data, X_BC, last)
+                return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
+            raise
+        estimate, used = found.estimate, found.inliers
+        self._X_BC = estimate.X_BC
+        work = np.mean([o.p_BR for o in used], axis=0)
+        error = radius_95(point_error_covariance(estimate, work))
+        odd = tuple((id, reason) for id, reason in found.refused if id in found.outliers)
+        said = (*found.result.unobservable, *found.result.warnings, *found.advice)
+        advice = None if found.seen.data is None else self._next(used, found.seen.data, estimate.X_BC, last)
+        return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
+
+    def _next(self, seen: Sequence[Observation], data: Dataset, X_BC: RigidTransform, last: ArmPose) -> Advice | None:
+        """Return the pose that lowers the error at the work point most, of those before the scanner within reach."""
+        rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
+        arm = load_arm(self._robot) if self._robot in known_arms() else None
+        p = np.array([o.p_CR for o in seen])
+        z = np.array([p[:, 2].min() / _WIDER, p[:, 2].max() * _WIDER])
+        side = np.maximum(_ASIDE, _WIDER * np.abs(p[:, :2] / p[:, 2:]).max(axis=0))
+        tried: list[tuple[float, RigidTransform]] = []
+        for _ in range(_TRIED):
+            place = rng.uniform(*z) * np.array([*rng.uniform(-side, side), 1.0])
+            X_CR = RigidTransform(_facing(place, rng), place)
+            tried.append((predicted_sigma([*taken, X_BC @ X_CR], X_BC), X_BC @ X_CR @ data.X_FR.inverse()))
+        q = HOME_Q if last.q is None else last.q
+        for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
+            if arm is None or nearest_solution(arm, X_BF, q) is not None:
+                before = predicted_sigma(taken, X_BC)
+                return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)
+        return None
+
+    def command(self, folder: Path) -> str:
+        """See CaptureTask."""
+        return f"weldcal calibrate {shlex.quote(str(folder))}"
+
+    def save(self, folder: Path) -> None:
+        """See CaptureTask."""
+        result = calibrate_flange(folder, known=self._known).result
+        (folder / RESULT).mkdir(exist_ok=True)
+        export_all(result, folder / RESULT)
+        save_result(result, folder / RESULT)
+
+    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+        """See CaptureTask."""
+        return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder / RESULT, checks).poses]
+
+
+class BoardTask:
+    """Pictures of a board by a camera on the flange or beside the robot; the folder is that of `weldcal hand-eye`."""
+
+    folder = "pictures"
+
+    def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
+        self._board, self._text, self._mounting = parse_board(board), board, mounting
+        self._robot, self._intrinsics, self._known = robot or None, intrinsics, dict[str, Picture]()
+        self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
+
+    def prepare(self, folder: Path) -> None:
+        """See CaptureTask."""
+        if self._intrinsics is not None:
+            shutil.copyfile(self._intrinsics, folder / self._intrinsics.name)
+
+    def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
+        """See CaptureTask."""
+        grey = load_grey(path)
+        if grey is None:
+            return None, f"'{path.name}' cannot be read as a picture."
+        if self._board.layouts > 1:
+            self._board = with_layout([grey], self._board)
+        points = find_board(grey, self._board)
+        seen = np.isfinite(points[:, 0])
+        if int(seen.sum()) < (4 if self._board.kind == "tag" else min(8, len(points))):
+            there = what_is_there([grey], self._board)
+            return None, (
+                f"The board {self._text} is not in the picture{f': {there}' if there else ''}. Show it whole, sharp and"
+                " evenly lit, with its white margin."
+            )
+        picture = Picture(name=path.name, points=points, size=grey.shape[::-1], thumbnail=b"")
+        gap = _gap(points)
+        if gap < _SMALL_PX:
+            return picture, f"The board's points are {gap:.0f} px apart: bring the board nearer."
+        width = _edge_px(grey, points[seen], gap)
+        if width > _SHARP_PX:
+            return picture, (
+                f"The picture is blurred: edges are {width:.0f} px wide. Let the arm rest, focus the camera, or expose"
+                " for a shorter time."
+            )
+        return picture, ""
+
+    def contradicts(self, one: Capture, other: Capture) -> str:
+        """See CaptureTask."""
+        if not isinstance(one.found, Picture) or not isinstance(other.found, Picture):
+            return ""
+        moved_px = float(np.nanmedian(np.linalg.norm(one.found.points - other.found.points, axis=1)))
+        away = one.pose.moved(other.pose)
+        if moved_px < 1.0 and away[0] > _CLEARLY_M:
+            return (
+                f"The board is where it was in {one.id}, to {moved_px:.1f} px, and the arm moved by {1e3 * away[0]:.0f}"
+                " mm: the picture is an older one, or the board moves with the camera."
+            )
+        return ""
+
+    def forget(self, id: str) -> None:
+        """See CaptureTask."""
+        for name in [name for name in self._known if Path(name).stem == id]:
+            del self._known[name]
+
+    def fresh(self) -> CaptureTask:
+        """See CaptureTask."""
+        return BoardTask(self._text, self._mounting, self._robot or "", self._intrinsics)
+
+    def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
+        """See CaptureTask."""
+        asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
+        found = calibrate_recorded(folder, asked, known=self._known)
+        result, step = found.result, found.next_pose
+        X, error = result.X, None
+        if step is not None:  # the work point is where the next pose shows the target
+            J = np.hstack([-skew(X.rotation() @ step.X_CM.translation()), np.eye(3)])
+            error = radius_95(J @ result.covariance["X"] @ J.T)
+        left_out = [] if found.pictures is None else found.pictures.pictures
+        odd = tuple((Path(p.name).stem, p.why) for p in left_out if p.why)
+        advice = None
+        if step is not None:
+            words = found.advice if step.X_BF is None else jog(last, step.X_BF)
+            advice = Advice(
+                X_BF=step.X_BF, words=words, sigma_before_m=step.sigma_before, sigma_after_m=step.sigma_after
+            )
+        said = (*result.unobservable, *result.warnings)
+        return CaptureVerdict(symbol=self.symbol, said=said, X=X, error_95_m=error, odd=odd, advice=advice)
+
+    def command(self, folder: Path) -> str:
+        """See CaptureTask."""
+        words = f"weldcal hand-eye ax-yb {shlex.quote(str(folder))} --board {shlex.quote(self._text)}"
+        return f"{words} --mounting {self._mounting}{f' --robot {self._robot}' if self._robot else ''}"
+
+    def save(self, folder: Path) -> None:
+        """See CaptureTask."""
+        raise InputError(f"Write the result with: {self.command(folder)}")
+
+    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+        """See CaptureTask."""
+        raise InputError("New pictures are judged by: weldcal verify.")
+
+
+def _facing(p: Array, rng: np.random.Generator) -> RotationMatrix:
+    """Draw an orientation of a face at p (3,) that looks back at the camera, within _TILT_RAD, turned at random."""
+    sight = -p / np.linalg.norm(p)
+    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ np.cross(sight, [1.0, 0.0, 0.0])
+    normal = exp_rotation(rng.uniform(0.0, _TILT_RAD) * side / np.linalg.norm(side)) @ sight
+    X = RotationMatrix.MakeFromOneVector(normal, 2)
+    return X @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
+
+
+def _gap(points: Array) -> float:
+    """Median distance px from each point to its nearest neighbour."""
+    p = points[np.isfinite(points[:, 0])]
+    return float(np.median(np.asarray(cKDTree(p).query(p, 2)[0])[:, 1])) if len(p) > 1 else np.inf
+
+
+def _edge_px(grey: NDArray[np.uint8], points: Array, gap: float) -> float:
+    """Median width px of the edges at a board's points: contrast over the steepest slope in a window of each."""
+    half = int(np.clip(0.45 * gap, 3, 40))
+    found = []
+    for u, v in points[:: max(1, len(points) // 40)]:
+        x, y = round(u), round(v)
+        part = grey[max(0, y - half) : y + half + 1, max(0, x - half) : x + half + 1].astype(float)
+        if min(part.shape) > 4:
+            dy, dx = np.gradient(part)
+            found.append(float(np.ptp(part)) / max(float(np.hypot(dx, dy).max()), 1.0))
+    return float(np.median(found)) if found else np.inf

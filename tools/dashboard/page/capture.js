@@ -1,0 +1,74 @@
+"use strict";
+// The capture page: shows the session from server-sent events, and sends what the buttons ask.
+const el = id => document.getElementById(id);
+const key = document.querySelector('meta[name="weldcal-key"]').content;
+const SILENT_MS = 3500;
+let heardAt = Date.now(), pictured = 0, last = null;
+
+const say = (id, text) => { const e = el(id); if (e.textContent !== text) e.textContent = text; };
+const show = (id, on) => { el(id).hidden = !on; };
+const ask = (what, value) => fetch("act/" + what, { method: "POST", headers: { "Content-Type": "application/json", "X-Weldcal-Key": key }, body: JSON.stringify({ value }) });
+const capture = () => { if (!el("capture").disabled) ask("capture", el("pose").value); };
+
+function list(id, items) {
+  const text = JSON.stringify(items);
+  if (el(id).dataset.shown === text) return;
+  el(id).dataset.shown = text;
+  el(id).replaceChildren(...items.map(([words, odd]) => { const li = document.createElement("li"); li.textContent = words; if (odd) li.className = "odd"; return li; }));
+}
+
+function shown(v) {
+  const busy = v.state !== "READY", one = v.last;
+  document.body.dataset.state = v.state === "READY" ? "DONE" : "RUNNING";
+  say("title", v.title);
+  say("arm", v.arm === v.sensor ? v.arm : v.arm + ", " + v.sensor);
+  say("state", v.state);
+  const bad = v.problem || (one && one.refused) || "";
+  el("line").className = bad ? "bad" : "";
+  say("line", bad || (one && !busy ? "Taken: " + one.id + "." : busy ? "" : "Bring the arm into a new pose, and capture."));
+  show("typed", v.typed);
+  show("auto", !v.typed);
+  el("by_itself").checked = v.by_itself;
+  el("capture").disabled = busy;
+  el("use").disabled = busy || v.used || v.matrix === null;
+  el("back").disabled = busy || v.used || !v.captures.length;
+  if (v.picture && v.picture !== pictured) { pictured = v.picture; el("picture").src = "picture/" + v.picture; el("picture").hidden = false; }
+  say("gain", v.advice_mm === null ? "" : "then " + v.advice_mm.toFixed(2) + " mm expected");
+  if (v.advice) say("advice", v.advice);
+  say("ur_pose", v.ur_pose || "");
+  say("error", v.error_mm === null ? "not yet known" : v.error_mm.toFixed(2) + " mm with 95 %, wanted " + v.required_mm.toFixed(2));
+  el("bar").style.width = v.error_mm === null ? "0" : Math.min(100, 100 * v.required_mm / v.error_mm) + "%";
+  show("matrix", v.matrix !== null);
+  if (v.matrix) say("matrix", v.symbol + " =\n" + v.matrix.map(r => r.map(x => x.toFixed(6).padStart(10)).join(" ")).join("\n"));
+  list("said", v.said.map(t => [t, false]));
+  say("count", String(v.captures.length));
+  list("captures", v.captures.map(c => [c.id + (c.odd ? ": " + c.odd : ""), !!c.odd]));
+  show("checking", v.used);
+  list("checks", v.checks.map(c => [c.error_mm.toFixed(3) + " mm", c.error_mm > v.required_mm]));
+  say("folder", v.folder);
+  say("command", v.command);
+  if (v.jogs && !el("jogs").children.length) {
+    for (const name of ["+x", "-x", "+y", "-y", "+z", "-z", "+rx", "-rx", "+ry", "-ry", "+rz", "-rz"]) {
+      const b = document.createElement("button");
+      b.type = "button"; b.textContent = name.includes("r") ? "turn " + name.replace("r", "") : name; b.addEventListener("click", () => ask("jog-" + name));
+      el("jogs").append(b);
+    }
+    const go = document.createElement("button");
+    go.type = "button"; go.id = "go"; go.textContent = "to the next pose"; go.style.gridColumn = "1 / -1"; go.addEventListener("click", () => ask("jog-next"));
+    el("jogs").append(go);
+  }
+  show("jogs", v.jogs);
+  last = v;
+}
+
+el("capture").addEventListener("click", capture);
+el("use").addEventListener("click", () => ask("use"));
+el("back").addEventListener("click", () => { if (last && last.captures.length) ask("back-" + last.captures[last.captures.length - 1].id); });
+el("by_itself").addEventListener("change", () => ask("by_itself"));
+document.addEventListener("keydown", e => {
+  if (e.code === "Space" && !["INPUT", "BUTTON"].includes(e.target.tagName)) { e.preventDefault(); capture(); }
+  if (e.code === "Enter" && e.target.id === "pose") capture();
+});
+const events = new EventSource("events");
+events.onmessage = e => { heardAt = Date.now(); const v = JSON.parse(e.data); if (v.closing) events.close(); shown(v); };
+setInterval(() => { if (Date.now() - heardAt > SILENT_MS) { say("state", "NO CONNECTION"); document.body.dataset.state = "NO CONNECTION"; el("capture").disabled = true; } }, 500);
