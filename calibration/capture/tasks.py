@@ -27,7 +27,7 @@ from weldcal.calibration.capture.session import (
 )
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
@@ -38,7 +38,7 @@ from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
-from weldcal.calibration.planning.calibration_poses import predicted_sigma
+from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
 from weldcal.calibration.recorded_flange import calibrate_flange
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
 from weldcal.calibration.verified_scans import verify_scans
@@ -126,7 +126,7 @@ class FlangeTask:
             seen = fit_flanges(data, self._standard, known=self._known)
             with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
                 X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
-                advice = self._next(seen.observations, seen.data or data, X_BC, last)
+                advice = next_scan(seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last)
                 return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
             raise
         estimate, used = found.estimate, found.inliers
@@ -135,27 +135,9 @@ class FlangeTask:
         error = radius_95(point_error_covariance(estimate, work))
         odd = tuple((id, reason) for id, reason in found.refused if id in found.outliers)
         said = (*found.result.unobservable, *found.result.warnings, *found.advice)
-        advice = None if found.seen.data is None else self._next(used, found.seen.data, estimate.X_BC, last)
+        read = found.seen.data
+        advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last)
         return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
-
-    def _next(self, seen: Sequence[Observation], data: Dataset, X_BC: RigidTransform, last: ArmPose) -> Advice | None:
-        """Return the pose that lowers the error at the work point most, of those before the scanner within reach."""
-        rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
-        arm = load_arm(self._robot) if self._robot in known_arms() else None
-        p = np.array([o.p_CR for o in seen])
-        z = np.array([p[:, 2].min() / _WIDER, p[:, 2].max() * _WIDER])
-        side = np.maximum(_ASIDE, _WIDER * np.abs(p[:, :2] / p[:, 2:]).max(axis=0))
-        tried: list[tuple[float, RigidTransform]] = []
-        for _ in range(_TRIED):
-            place = rng.uniform(*z) * np.array([*rng.uniform(-side, side), 1.0])
-            X_CR = RigidTransform(_facing(place, rng), place)
-            tried.append((predicted_sigma([*taken, X_BC @ X_CR], X_BC), X_BC @ X_CR @ data.X_FR.inverse()))
-        q = HOME_Q if last.q is None else last.q
-        for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
-            if arm is None or nearest_solution(arm, X_BF, q) is not None:
-                before = predicted_sigma(taken, X_BC)
-                return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)
-        return None
 
     def command(self, folder: Path) -> str:
         """See CaptureTask."""
@@ -269,6 +251,37 @@ class BoardTask:
     def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
         """See CaptureTask."""
         raise InputError("New pictures are judged by: weldcal verify.")
+
+
+def next_scan(
+    seen: Sequence[Observation], X_BC: RigidTransform, X_FR: RigidTransform, robot: str, last: ArmPose
+) -> Advice | None:
+    """Return the pose that lowers the error at the work point most, of those before the scanner within reach.
+
+    Args:
+        seen: the scans so far; the next one is about as far away, a little wider. The work point is their middle.
+        X_BC: the scanner in the base, as they give it. X_FR: the feature on the flange.
+        robot: an arm whose reach is looked at; any other name: it is not.
+        last: where the arm is.
+    """
+    rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
+    arm = load_arm(robot) if robot in known_arms() else None
+    p = np.array([o.p_CR for o in seen])
+    x, y, z = np.mean([X.translation() for X in taken], axis=0).tolist()
+    config = PlannerConfig(work_point_B=(x, y, z))
+    depth = np.array([p[:, 2].min() / _WIDER, p[:, 2].max() * _WIDER])
+    side = np.maximum(_ASIDE, _WIDER * np.abs(p[:, :2] / p[:, 2:]).max(axis=0))
+    tried: list[tuple[float, RigidTransform]] = []
+    for _ in range(_TRIED):
+        place = rng.uniform(*depth) * np.array([*rng.uniform(-side, side), 1.0])
+        X_BR = X_BC @ RigidTransform(_facing(place, rng), place)
+        tried.append((predicted_sigma([*taken, X_BR], X_BC, config), X_BR @ X_FR.inverse()))
+    q = HOME_Q if last.q is None else last.q
+    for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
+        if arm is None or nearest_solution(arm, X_BF, q) is not None:
+            before = predicted_sigma(taken, X_BC, config)
+            return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)
+    return None
 
 
 def _facing(p: Array, rng: np.random.Generator) -> RotationMatrix:
