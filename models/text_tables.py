@@ -25,6 +25,9 @@ def separator_of(lines: Sequence[str]) -> str:
 
     A comma inside of a cell is a decimal comma, else commas separate the cells.
     """
+    for mark in (";", "\t"):  # a first line without commas has no decimal ones either: a header, or whole numbers
+        if lines and mark in lines[0].strip() and "," not in lines[0]:
+            return mark
     sample = [s for s in lines[:_SAMPLE] if re.search(r"\d", s)] or list(lines[:_SAMPLE])
     for mark in (";", "\t", " "):
         if sample and 2 * sum(_separates(mark, s.strip()) for s in sample) >= len(sample):
