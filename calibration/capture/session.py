@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -23,7 +24,7 @@ from weldcal.models.files import write_atomic
 
 POSES_FILE = "robot.csv"
 RESULT, CHECKS = "calibration", "checks"
-"""Folders of a session: the result in use, and the captures that judge it."""
+"""Folders beside that of the captures: the result in use, and the captures that judge it."""
 LEAST = 3
 """Captures from which on a calibration is tried."""
 _SAME_M, _SAME_RAD = 2e-3, np.radians(1.0)  # a choice: below any move on purpose, above what an arm repeats to
@@ -142,8 +143,8 @@ class CaptureTask(Protocol):
     def save(self, folder: Path) -> None:
         """Calibrate, and write the result into the folder's RESULT. Raises WeldcalError as the command does."""
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
-        """Return the errors m of the captures in ``checks`` by the result that was saved. Raises WeldcalError."""
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
+        """Return id and error (m) of captures in CHECKS by the result that was saved. Raises WeldcalError."""
 
 
 class CaptureSession:
@@ -221,11 +222,11 @@ class CaptureSession:
 
     def check(self, source: Path, pose: ArmPose, after: ArmPose | None = None) -> tuple[Capture, float]:
         """Judge the result in use by a capture that it never saw; returns it, and its error (m; NaN where refused)."""
-        self._checks = self._checks or CaptureSession(self.folder / CHECKS, self.task.fresh())
+        self._checks = self._checks or CaptureSession(self.folder.parent / CHECKS, self.task.fresh())
         one = self._checks.take(source, pose, after)
         if one.refused:
             return one, np.nan
-        return one, dict(self.task.judge(self.folder, self._checks.folder))[one.id]
+        return one, dict(self.task.judge(self.folder, self._checks.captures))[one.id]
 
     def _repeats(self, one: Capture, source: Path) -> str:
         """Say which capture is repeated by a file or a pose; "" where none is."""

@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.capture.session import (
+    CHECKS,
     LEAST,
     POSES_FILE,
     RESULT,
@@ -36,11 +37,12 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
-from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
+from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey, solutions
 from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
 from weldcal.calibration.recorded_flange import calibrate_flange
-from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions, RecordedHandEye, calibrate_recorded
 from weldcal.calibration.verified_scans import verify_scans
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -146,13 +148,13 @@ class FlangeTask:
     def save(self, folder: Path) -> None:
         """See CaptureTask."""
         result = calibrate_flange(folder, known=self._known).result
-        (folder / RESULT).mkdir(exist_ok=True)
-        export_all(result, folder / RESULT)
-        save_result(result, folder / RESULT)
+        (folder.parent / RESULT).mkdir(exist_ok=True)
+        export_all(result, folder.parent / RESULT)
+        save_result(result, folder.parent / RESULT)
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
         """See CaptureTask."""
-        return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder / RESULT, checks).poses]
+        return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder.parent / RESULT, folder.parent / CHECKS).poses]
 
 
 class BoardTask:
@@ -163,6 +165,7 @@ class BoardTask:
     def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
         self._board, self._text, self._mounting = parse_board(board), board, mounting
         self._robot, self._intrinsics, self._known = robot or None, intrinsics, dict[str, Picture]()
+        self._used: RecordedHandEye | None = None
         self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
 
     def prepare(self, folder: Path) -> None:
@@ -221,8 +224,7 @@ class BoardTask:
 
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """See CaptureTask."""
-        asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
-        found = calibrate_recorded(folder, asked, known=self._known)
+        found = self._calibrated(folder)
         result, step = found.result, found.next_pose
         X, error = result.X, None
         if step is not None:  # the work point is where the next pose shows the target
@@ -244,13 +246,32 @@ class BoardTask:
         words = f"weldcal hand-eye ax-yb {shlex.quote(str(folder))} --board {shlex.quote(self._text)}"
         return f"{words} --mounting {self._mounting}{f' --robot {self._robot}' if self._robot else ''}"
 
+    def _calibrated(self, folder: Path) -> RecordedHandEye:
+        asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
+        return calibrate_recorded(folder, asked, known=self._known)
+
     def save(self, folder: Path) -> None:
         """See CaptureTask."""
-        raise InputError(f"Write the result with: {self.command(folder)}")
+        self._used = self._calibrated(folder)
+        (folder.parent / RESULT).mkdir(exist_ok=True)
+        of = Provenance(folder.name, digest(folder / POSES_FILE))
+        export_hand_eye(self._used.result, self._used.mounting, folder.parent / RESULT, of)
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
         """See CaptureTask."""
-        raise InputError("New pictures are judged by: weldcal verify.")
+        if self._used is None or self._used.pictures is None:
+            raise InputError('Press "Use it" first: the camera of that result reads the new pictures.')
+        bundle, X, Y = self._used.pictures.bundle, self._used.result.poses["X"], self._used.result.poses["Y"]
+        found = []
+        for one in checks:
+            if one.pose.X_BF is None or not isinstance(one.found, Picture):
+                raise InputError("Typed poses cannot judge a camera: verify it on a second session by weldcal verify.")
+            C = RigidTransform(solutions(one.found.points, self._board, bundle.K, bundle.distortion)[0][1])
+            on_base = self._mounting == "eye_on_base"  # X C = F Y with the camera on the base, F X C = Y in the hand
+            seen, stated = (X @ C, one.pose.X_BF @ Y) if on_base else (one.pose.X_BF @ X @ C, Y)
+            middle = self._board.points.mean(axis=0)
+            found.append((one.id, float(np.linalg.norm(seen @ middle - stated @ middle))))
+        return found
 
 
 def next_scan(

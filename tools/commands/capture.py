@@ -55,18 +55,23 @@ def capture(
 ) -> dict[str, object]:
     """Take scans of the flange, or pictures of a board, by hand; the page judges each and proposes the next pose.
 
-    Nothing is sent to the robot. All captures are in the folder of --out, which `weldcal calibrate` or `weldcal
-    hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
+    Nothing is sent to the robot. All captures are in `captures` of --out, which `weldcal calibrate` or
+    `weldcal hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
     """
     cell = DemoCell(call.seed) if demo else None
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
     task: CaptureTask = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
-    run = CaptureRun(CaptureSession(out, task), arm, sensor, required_mm, "weldcal capture")
+    run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
     with closing(run):
         _serve(run, call.live["browser"])
-    return {"state": "done", "folder": str(out), "captures": len(run.session.captures), "next": task.command(out)}
+    return {
+        "state": "done",
+        "folder": str(out),
+        "captures": len(run.session.captures),
+        "next": task.command(run.session.folder),
+    }
 
 
 def _serve(run: CaptureRun, browser: bool) -> None:

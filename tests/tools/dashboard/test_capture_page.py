@@ -33,7 +33,7 @@ def until(done: Callable[[], bool]) -> None:
 def run(tmp_path: Path) -> Iterator[CaptureRun]:
     cell = DemoCell(5)
     with closing(
-        CaptureRun(CaptureSession(tmp_path, FlangeTask(ROBOT, "ISO 9409-1-50-4-M6")), cell, cell, 0.1, "demo")
+        CaptureRun(CaptureSession(tmp_path / "s", FlangeTask(ROBOT, "ISO 9409-1-50-4-M6")), cell, cell, 0.1, "demo")
     ) as one:
         yield one
 
@@ -60,5 +60,5 @@ def test_a_person_reaches_a_calibration_by_the_page_alone(run: CaptureRun, brows
     assert run.verdict.error_95_m is not None
     off = np.linalg.norm(run.verdict.X.translation() - cell.X_BC.translation())
     assert off < 2e-4
-    again = calibrate_flange(tmp_path)
+    again = calibrate_flange(tmp_path / "s")
     assert (again.result.X_BC.GetAsMatrix4() == run.verdict.X.GetAsMatrix4()).all()
