@@ -25,6 +25,7 @@ PERIOD_S = 0.5
 
 @command(
     "capture",
+    keys=("intrinsics",),
     options=("browser", "seed"),
     common=LOOK,
     short_help="Capture by hand: each scan or picture is judged at once.",
@@ -62,7 +63,11 @@ def capture(
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
-    task: CaptureTask = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
+    task: CaptureTask = (
+        BoardTask(board, mounting, robot, call.reading.get("intrinsics"))
+        if board
+        else FlangeTask(robot, flange or _flange_of(robot))
+    )
     run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
     with closing(run):
         _serve(run, call.live["browser"])
