@@ -26,6 +26,7 @@ from weldcal.calibration.capture.session import (
     CaptureVerdict,
     jog,
 )
+from weldcal.calibration.data.camera_file import read_camera
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.dataset import load_dataset
@@ -165,6 +166,8 @@ class BoardTask:
     def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
         self._board, self._text, self._mounting = parse_board(board), board, mounting
         self._robot, self._intrinsics, self._known = robot or None, intrinsics, dict[str, Picture]()
+        if intrinsics is not None:
+            read_camera(intrinsics)  # it can be read
         self._used: RecordedHandEye | None = None
         self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
 
