@@ -40,7 +40,7 @@ from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
-from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey, solutions
+from weldcal.calibration.hand_eye.pictures.search import FEWEST, Picture, load_grey, solutions
 from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
 from weldcal.calibration.recorded_flange import calibrate_flange
 from weldcal.calibration.recorded_hand_eye import HandEyeOptions, RecordedHandEye, calibrate_recorded
@@ -53,6 +53,7 @@ from weldcal.models.files import write_atomic
 from weldcal.models.robots import stated_flange
 
 _APART_M, _APART = 0.01, 0.05  # a choice: centres in two frames differ by less, also with a wrong scale or a small TCP
+_SHUN_M, _SHUN_RAD = 0.05, np.radians(15.0)  # a choice: about a pose whose scan was of no use
 _CLEARLY_M = 0.02  # a choice: of the arm, which a camera at 3 m would show by several pixels
 _EDGE_SEEN = 0.6  # a choice: share of the flange's edge; less leaves its centre open across the missing part
 _SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures have 2 to 3, soft large ones 5
@@ -67,12 +68,13 @@ HOME_Q = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
 class FlangeTask:
     """Scans of the flange by a scanner beside the robot; the folder is that of `weldcal calibrate`."""
 
-    symbol, folder = "X_BC", "clouds"
+    symbol, folder, least = "X_BC", "clouds", LEAST
 
     def __init__(self, robot: str, flange: str) -> None:
         self._standard = stated_flange(flange, robot)
         self._robot, self._known = robot, dict[str, FlangeScan]()
         self._X_BC: RigidTransform | None = None
+        self._shunned: list[RigidTransform] = []
 
     def prepare(self, folder: Path) -> None:
         """See CaptureTask."""
@@ -88,7 +90,7 @@ class FlangeTask:
             return None, refusal.reason
         found = self._known[id] = flange_scan(points, self._standard)
         if not isinstance(found, tuple):
-            return None, found.reason
+            return None, f"{found.reason} Let the flange face the scanner, whole and near the middle of its view."
         fit = found[0]
         if fit.coverage < _EDGE_SEEN:
             return fit, (
@@ -112,9 +114,11 @@ class FlangeTask:
             " TCP is set at the robot)."
         )
 
-    def forget(self, id: str) -> None:
+    def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
         self._known.pop(id, None)
+        if shunned is not None and shunned.X_BF is not None:
+            self._shunned.append(shunned.X_BF)
 
     def fresh(self) -> CaptureTask:
         """See CaptureTask."""
@@ -129,17 +133,23 @@ class FlangeTask:
             seen = fit_flanges(data, self._standard, known=self._known)
             with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
                 X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
-                advice = next_scan(seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last)
+                advice = next_scan(seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last, self._shunned)
                 return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
             raise
         estimate, used = found.estimate, found.inliers
         self._X_BC = estimate.X_BC
         work = np.mean([o.p_BR for o in used], axis=0)
-        error = radius_95(point_error_covariance(estimate, work))
+        held = estimate.held_out.position_m[estimate.inliers]
+        held = held[np.isfinite(held)]  # as the first screen of calibrate: the larger of both
+        error = max(
+            radius_95(point_error_covariance(estimate, work)), *np.percentile(held, [95]) if len(held) else [0.0]
+        )
         odd = tuple((id, reason) for id, reason in found.refused if id in found.outliers)
         said = (*found.result.unobservable, *found.result.warnings, *found.advice)
         read = found.seen.data
-        advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last)
+        if read is not None and last.X_BF is None:
+            last = ArmPose(X_BF=list(read.poses.values())[-1])
+        advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last, self._shunned)
         return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
 
     def command(self, folder: Path) -> str:
@@ -161,7 +171,7 @@ class FlangeTask:
 class BoardTask:
     """Pictures of a board by a camera on the flange or beside the robot; the folder is that of `weldcal hand-eye`."""
 
-    folder = "pictures"
+    folder, least = "pictures", FEWEST
 
     def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
         self._board, self._text, self._mounting = parse_board(board), board, mounting
@@ -216,7 +226,7 @@ class BoardTask:
             )
         return ""
 
-    def forget(self, id: str) -> None:
+    def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
         for name in [name for name in self._known if Path(name).stem == id]:
             del self._known[name]
@@ -278,7 +288,12 @@ class BoardTask:
 
 
 def next_scan(
-    seen: Sequence[Observation], X_BC: RigidTransform, X_FR: RigidTransform, robot: str, last: ArmPose
+    seen: Sequence[Observation],
+    X_BC: RigidTransform,
+    X_FR: RigidTransform,
+    robot: str,
+    last: ArmPose,
+    shunned: Sequence[RigidTransform] = (),
 ) -> Advice | None:
     """Return the pose that lowers the error at the work point most, of those before the scanner within reach.
 
@@ -286,7 +301,7 @@ def next_scan(
         seen: the scans so far; the next one is about as far away, a little wider. The work point is their middle.
         X_BC: the scanner in the base, as they give it. X_FR: the feature on the flange.
         robot: an arm whose reach is looked at; any other name: it is not.
-        last: where the arm is.
+        last: where the arm is. shunned: poses X_BF at which a scan was of no use.
     """
     rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
     arm = load_arm(robot) if robot in known_arms() else None
@@ -302,6 +317,9 @@ def next_scan(
         tried.append((predicted_sigma([*taken, X_BR], X_BC, config), X_BR @ X_FR.inverse()))
     q = HOME_Q if last.q is None else last.q
     for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
+        near = [ArmPose(X_BF=X_BF).moved(ArmPose(X_BF=X)) for X in shunned]
+        if any(away < _SHUN_M and turn < _SHUN_RAD for away, turn in near):
+            continue
         if arm is None or nearest_solution(arm, X_BF, q) is not None:
             before = predicted_sigma(taken, X_BC, config)
             return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)

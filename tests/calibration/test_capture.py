@@ -198,6 +198,27 @@ def test_the_result_in_use_is_judged_by_new_captures(tmp_path: Path, cell: DemoC
     assert len(one.captures) == len(MOVES), "what judges is not what calibrates"
 
 
+def test_a_session_of_another_kind_is_refused_and_left_as_it_is(begun: CaptureSession) -> None:
+    before = sorted(p.name for p in begun.folder.rglob("*"))
+    with pytest.raises(InputError, match="is a session of clouds, and these are pictures"):
+        CaptureSession(begun.folder, BoardTask(BOARD, "eye_in_hand"))
+    assert sorted(p.name for p in begun.folder.rglob("*")) == before
+
+
+def test_a_pose_whose_scan_was_refused_is_not_proposed_again(
+    begun: CaptureSession, cell: DemoCell, tmp_path: Path
+) -> None:
+    assert not take(begun, cell, tmp_path).refused
+    first = begun.verdict().advice
+    assert first is not None
+    assert first.X_BF is not None
+    cell.jog("next", first.X_BF)
+    assert begun.take(wrong_scan(cell, tmp_path, "nothing there"), cell.pose()).refused
+    second = begun.verdict().advice
+    assert second is not None
+    assert max(ArmPose(X_BF=first.X_BF).moved(ArmPose(X_BF=second.X_BF))) > 0.05
+
+
 def test_a_capture_is_taken_back(begun: CaptureSession, cell: DemoCell, tmp_path: Path) -> None:
     begun.take_back("002")
     assert [c.id for c in begun.captures] == ["001", "003"]
