@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -22,8 +23,12 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import write_atomic
 
 POSES_FILE = "robot.csv"
+FOLDERS = ("clouds", "pictures")
+"""Of the kinds of captures, one in a session."""
+TYPED = 5
+"""Captures with typed poses from which on they show together how the numbers are to be read."""
 RESULT, CHECKS = "calibration", "checks"
-"""Folders of a session: the result in use, and the captures that judge it."""
+"""Folders beside that of the captures: the result in use, and the captures that judge it."""
 LEAST = 3
 """Captures from which on a calibration is tried."""
 _SAME_M, _SAME_RAD = 2e-3, np.radians(1.0)  # a choice: below any move on purpose, above what an arm repeats to
@@ -117,6 +122,7 @@ class CaptureTask(Protocol):
 
     symbol: str
     folder: str
+    least: int
 
     def prepare(self, folder: Path) -> None:
         """Write what the folder needs besides captures."""
@@ -127,8 +133,8 @@ class CaptureTask(Protocol):
     def contradicts(self, one: Capture, other: Capture) -> str:
         """Say how the move from one capture to the other contradicts that of the arm; "" where it does not."""
 
-    def forget(self, id: str) -> None:
-        """Drop what was found in a capture."""
+    def forget(self, id: str, shunned: ArmPose | None = None) -> None:
+        """Drop what was found in a capture; ``shunned``: a pose that is not to be proposed again."""
 
     def fresh(self) -> CaptureTask:
         """Return the same task, with nothing found yet."""
@@ -142,8 +148,8 @@ class CaptureTask(Protocol):
     def save(self, folder: Path) -> None:
         """Calibrate, and write the result into the folder's RESULT. Raises WeldcalError as the command does."""
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
-        """Return the errors m of the captures in ``checks`` by the result that was saved. Raises WeldcalError."""
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
+        """Return id and error (m) of captures in CHECKS by the result that was saved. Raises WeldcalError."""
 
 
 class CaptureSession:
@@ -156,6 +162,9 @@ class CaptureSession:
         self.folder, self.task = folder, task
         self.captures: list[Capture] = []
         self._checks: CaptureSession | None = None
+        other = next((name for name in FOLDERS if name != task.folder and (folder / name).is_dir()), None)
+        if other is not None:
+            raise InputError(f"'{folder}' is a session of {other}, and these are {task.folder}: name another folder.")
         (folder / task.folder).mkdir(parents=True, exist_ok=True)
         rows = self._rows()
         files = {cloud_id(p): p for p in (folder / task.folder).iterdir() if not p.name.startswith(".")}
@@ -193,7 +202,7 @@ class CaptureSession:
             why = against[-1] if 2 * len(against) > len(self.captures) else ""
         if why:
             kept.unlink()
-            self.task.forget(id)
+            self.task.forget(id, pose)
             return replace(one, refused=why)
         self._write([*self.captures, one])
         return one
@@ -209,8 +218,10 @@ class CaptureSession:
 
     def verdict(self) -> CaptureVerdict:
         """Return what the captures say together: the calibration of this folder, as its command gives it."""
-        if len(self.captures) < LEAST:
-            need = LEAST - len(self.captures)
+        typed = bool(self.captures) and self.captures[0].pose.X_BF is None
+        least = max(self.task.least, TYPED if typed else 0)
+        if len(self.captures) < least:
+            need = least - len(self.captures)
             return CaptureVerdict(
                 symbol=self.task.symbol, said=(f"{need} more capture{'s' * (need > 1)} for a first estimate.",)
             )
@@ -221,11 +232,11 @@ class CaptureSession:
 
     def check(self, source: Path, pose: ArmPose, after: ArmPose | None = None) -> tuple[Capture, float]:
         """Judge the result in use by a capture that it never saw; returns it, and its error (m; NaN where refused)."""
-        self._checks = self._checks or CaptureSession(self.folder / CHECKS, self.task.fresh())
+        self._checks = self._checks or CaptureSession(self.folder.parent / CHECKS, self.task.fresh())
         one = self._checks.take(source, pose, after)
         if one.refused:
             return one, np.nan
-        return one, dict(self.task.judge(self.folder, self._checks.folder))[one.id]
+        return one, dict(self.task.judge(self.folder, self._checks.captures))[one.id]
 
     def _repeats(self, one: Capture, source: Path) -> str:
         """Say which capture is repeated by a file or a pose; "" where none is."""

@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.capture.session import (
+    CHECKS,
     LEAST,
     POSES_FILE,
     RESULT,
@@ -25,9 +26,10 @@ from weldcal.calibration.capture.session import (
     CaptureVerdict,
     jog,
 )
+from weldcal.calibration.data.camera_file import read_camera
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
@@ -36,11 +38,12 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board, what_is_there, with_layout
-from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
-from weldcal.calibration.planning.calibration_poses import predicted_sigma
+from weldcal.calibration.hand_eye.pictures.search import FEWEST, Picture, load_grey, solutions
+from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
 from weldcal.calibration.recorded_flange import calibrate_flange
-from weldcal.calibration.recorded_hand_eye import HandEyeOptions, calibrate_recorded
+from weldcal.calibration.recorded_hand_eye import HandEyeOptions, RecordedHandEye, calibrate_recorded
 from weldcal.calibration.verified_scans import verify_scans
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -50,6 +53,7 @@ from weldcal.models.files import write_atomic
 from weldcal.models.robots import stated_flange
 
 _APART_M, _APART = 0.01, 0.05  # a choice: centres in two frames differ by less, also with a wrong scale or a small TCP
+_SHUN_M, _SHUN_RAD = 0.05, np.radians(15.0)  # a choice: about a pose whose scan was of no use
 _CLEARLY_M = 0.02  # a choice: of the arm, which a camera at 3 m would show by several pixels
 _EDGE_SEEN = 0.6  # a choice: share of the flange's edge; less leaves its centre open across the missing part
 _SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures have 2 to 3, soft large ones 5
@@ -64,12 +68,13 @@ HOME_Q = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
 class FlangeTask:
     """Scans of the flange by a scanner beside the robot; the folder is that of `weldcal calibrate`."""
 
-    symbol, folder = "X_BC", "clouds"
+    symbol, folder, least = "X_BC", "clouds", LEAST
 
     def __init__(self, robot: str, flange: str) -> None:
         self._standard = stated_flange(flange, robot)
         self._robot, self._known = robot, dict[str, FlangeScan]()
         self._X_BC: RigidTransform | None = None
+        self._shunned: list[RigidTransform] = []
 
     def prepare(self, folder: Path) -> None:
         """See CaptureTask."""
@@ -85,7 +90,7 @@ class FlangeTask:
             return None, refusal.reason
         found = self._known[id] = flange_scan(points, self._standard)
         if not isinstance(found, tuple):
-            return None, found.reason
+            return None, f"{found.reason} Let the flange face the scanner, whole and near the middle of its view."
         fit = found[0]
         if fit.coverage < _EDGE_SEEN:
             return fit, (
@@ -109,9 +114,11 @@ class FlangeTask:
             " TCP is set at the robot)."
         )
 
-    def forget(self, id: str) -> None:
+    def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
         self._known.pop(id, None)
+        if shunned is not None and shunned.X_BF is not None:
+            self._shunned.append(shunned.X_BF)
 
     def fresh(self) -> CaptureTask:
         """See CaptureTask."""
@@ -126,36 +133,24 @@ class FlangeTask:
             seen = fit_flanges(data, self._standard, known=self._known)
             with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
                 X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
-                advice = self._next(seen.observations, seen.data or data, X_BC, last)
+                advice = next_scan(seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last, self._shunned)
                 return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
             raise
         estimate, used = found.estimate, found.inliers
         self._X_BC = estimate.X_BC
         work = np.mean([o.p_BR for o in used], axis=0)
-        error = radius_95(point_error_covariance(estimate, work))
+        held = estimate.held_out.position_m[estimate.inliers]
+        held = held[np.isfinite(held)]  # as the first screen of calibrate: the larger of both
+        error = max(
+            radius_95(point_error_covariance(estimate, work)), *np.percentile(held, [95]) if len(held) else [0.0]
+        )
         odd = tuple((id, reason) for id, reason in found.refused if id in found.outliers)
         said = (*found.result.unobservable, *found.result.warnings, *found.advice)
-        advice = None if found.seen.data is None else self._next(used, found.seen.data, estimate.X_BC, last)
+        read = found.seen.data
+        if read is not None and last.X_BF is None:
+            last = ArmPose(X_BF=list(read.poses.values())[-1])
+        advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last, self._shunned)
         return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
-
-    def _next(self, seen: Sequence[Observation], data: Dataset, X_BC: RigidTransform, last: ArmPose) -> Advice | None:
-        """Return the pose that lowers the error at the work point most, of those before the scanner within reach."""
-        rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
-        arm = load_arm(self._robot) if self._robot in known_arms() else None
-        p = np.array([o.p_CR for o in seen])
-        z = np.array([p[:, 2].min() / _WIDER, p[:, 2].max() * _WIDER])
-        side = np.maximum(_ASIDE, _WIDER * np.abs(p[:, :2] / p[:, 2:]).max(axis=0))
-        tried: list[tuple[float, RigidTransform]] = []
-        for _ in range(_TRIED):
-            place = rng.uniform(*z) * np.array([*rng.uniform(-side, side), 1.0])
-            X_CR = RigidTransform(_facing(place, rng), place)
-            tried.append((predicted_sigma([*taken, X_BC @ X_CR], X_BC), X_BC @ X_CR @ data.X_FR.inverse()))
-        q = HOME_Q if last.q is None else last.q
-        for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
-            if arm is None or nearest_solution(arm, X_BF, q) is not None:
-                before = predicted_sigma(taken, X_BC)
-                return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)
-        return None
 
     def command(self, folder: Path) -> str:
         """See CaptureTask."""
@@ -164,23 +159,26 @@ class FlangeTask:
     def save(self, folder: Path) -> None:
         """See CaptureTask."""
         result = calibrate_flange(folder, known=self._known).result
-        (folder / RESULT).mkdir(exist_ok=True)
-        export_all(result, folder / RESULT)
-        save_result(result, folder / RESULT)
+        (folder.parent / RESULT).mkdir(exist_ok=True)
+        export_all(result, folder.parent / RESULT)
+        save_result(result, folder.parent / RESULT)
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
         """See CaptureTask."""
-        return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder / RESULT, checks).poses]
+        return [(p.id, 1e-3 * p.error_mm) for p in verify_scans(folder.parent / RESULT, folder.parent / CHECKS).poses]
 
 
 class BoardTask:
     """Pictures of a board by a camera on the flange or beside the robot; the folder is that of `weldcal hand-eye`."""
 
-    folder = "pictures"
+    folder, least = "pictures", FEWEST
 
     def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
         self._board, self._text, self._mounting = parse_board(board), board, mounting
         self._robot, self._intrinsics, self._known = robot or None, intrinsics, dict[str, Picture]()
+        if intrinsics is not None:
+            read_camera(intrinsics)  # it can be read
+        self._used: RecordedHandEye | None = None
         self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
 
     def prepare(self, folder: Path) -> None:
@@ -228,7 +226,7 @@ class BoardTask:
             )
         return ""
 
-    def forget(self, id: str) -> None:
+    def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
         for name in [name for name in self._known if Path(name).stem == id]:
             del self._known[name]
@@ -239,8 +237,7 @@ class BoardTask:
 
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """See CaptureTask."""
-        asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
-        found = calibrate_recorded(folder, asked, known=self._known)
+        found = self._calibrated(folder)
         result, step = found.result, found.next_pose
         X, error = result.X, None
         if step is not None:  # the work point is where the next pose shows the target
@@ -262,13 +259,71 @@ class BoardTask:
         words = f"weldcal hand-eye ax-yb {shlex.quote(str(folder))} --board {shlex.quote(self._text)}"
         return f"{words} --mounting {self._mounting}{f' --robot {self._robot}' if self._robot else ''}"
 
+    def _calibrated(self, folder: Path) -> RecordedHandEye:
+        asked = HandEyeOptions(board=self._text, mounting=self._mounting, robot=self._robot, corners=None)
+        return calibrate_recorded(folder, asked, known=self._known)
+
     def save(self, folder: Path) -> None:
         """See CaptureTask."""
-        raise InputError(f"Write the result with: {self.command(folder)}")
+        self._used = self._calibrated(folder)
+        (folder.parent / RESULT).mkdir(exist_ok=True)
+        of = Provenance(folder.name, digest(folder / POSES_FILE))
+        export_hand_eye(self._used.result, self._used.mounting, folder.parent / RESULT, of)
 
-    def judge(self, folder: Path, checks: Path) -> list[tuple[str, float]]:
+    def judge(self, folder: Path, checks: Sequence[Capture]) -> list[tuple[str, float]]:
         """See CaptureTask."""
-        raise InputError("New pictures are judged by: weldcal verify.")
+        if self._used is None or self._used.pictures is None:
+            raise InputError('Press "Use it" first: the camera of that result reads the new pictures.')
+        bundle, X, Y = self._used.pictures.bundle, self._used.result.poses["X"], self._used.result.poses["Y"]
+        found = []
+        for one in checks:
+            if one.pose.X_BF is None or not isinstance(one.found, Picture):
+                raise InputError("Typed poses cannot judge a camera: verify it on a second session by weldcal verify.")
+            C = RigidTransform(solutions(one.found.points, self._board, bundle.K, bundle.distortion)[0][1])
+            on_base = self._mounting == "eye_on_base"  # X C = F Y with the camera on the base, F X C = Y in the hand
+            seen, stated = (X @ C, one.pose.X_BF @ Y) if on_base else (one.pose.X_BF @ X @ C, Y)
+            middle = self._board.points.mean(axis=0)
+            found.append((one.id, float(np.linalg.norm(seen @ middle - stated @ middle))))
+        return found
+
+
+def next_scan(
+    seen: Sequence[Observation],
+    X_BC: RigidTransform,
+    X_FR: RigidTransform,
+    robot: str,
+    last: ArmPose,
+    shunned: Sequence[RigidTransform] = (),
+) -> Advice | None:
+    """Return the pose that lowers the error at the work point most, of those before the scanner within reach.
+
+    Args:
+        seen: the scans so far; the next one is about as far away, a little wider. The work point is their middle.
+        X_BC: the scanner in the base, as they give it. X_FR: the feature on the flange.
+        robot: an arm whose reach is looked at; any other name: it is not.
+        last: where the arm is. shunned: poses X_BF at which a scan was of no use.
+    """
+    rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
+    arm = load_arm(robot) if robot in known_arms() else None
+    p = np.array([o.p_CR for o in seen])
+    x, y, z = np.mean([X.translation() for X in taken], axis=0).tolist()
+    config = PlannerConfig(work_point_B=(x, y, z))
+    depth = np.array([p[:, 2].min() / _WIDER, p[:, 2].max() * _WIDER])
+    side = np.maximum(_ASIDE, _WIDER * np.abs(p[:, :2] / p[:, 2:]).max(axis=0))
+    tried: list[tuple[float, RigidTransform]] = []
+    for _ in range(_TRIED):
+        place = rng.uniform(*depth) * np.array([*rng.uniform(-side, side), 1.0])
+        X_BR = X_BC @ RigidTransform(_facing(place, rng), place)
+        tried.append((predicted_sigma([*taken, X_BR], X_BC, config), X_BR @ X_FR.inverse()))
+    q = HOME_Q if last.q is None else last.q
+    for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
+        near = [ArmPose(X_BF=X_BF).moved(ArmPose(X_BF=X)) for X in shunned]
+        if any(away < _SHUN_M and turn < _SHUN_RAD for away, turn in near):
+            continue
+        if arm is None or nearest_solution(arm, X_BF, q) is not None:
+            before = predicted_sigma(taken, X_BC, config)
+            return Advice(X_BF=X_BF, words=jog(last, X_BF), sigma_before_m=before, sigma_after_m=sigma)
+    return None
 
 
 def _facing(p: Array, rng: np.random.Generator) -> RotationMatrix:

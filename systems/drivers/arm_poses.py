@@ -32,6 +32,10 @@ _ORTHOGONAL = 1e-3  # of a printed rotation matrix: three decimals
 _NUMBER = re.compile(r"(?<![A-Za-z_\d.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
+_COMMAS = re.compile(r"\d,\d+\s+[-+]?\d+,\d")
+_FARTHEST = 1e5  # of a position: 100 m in millimetres, beyond any arm
+
+
 class NoPose(WeldcalError):
     """A source of poses gives none; the sentence says what to do."""
 
@@ -76,7 +80,7 @@ def pose_of_text(text: str) -> ArmPose:
     Raises:
         NoPose: it holds another number of numbers, or a matrix that is no pose.
     """
-    if ";" in text:  # between numbers with decimal commas, as in German exports
+    if ";" in text or ("." not in text and _COMMAS.search(text)):  # decimal commas, as in German exports
         text = re.sub(r"(\d),(\d)", r"\1.\2", text)
     numbers = tuple(float(found) for found in _NUMBER.findall(text))
     if len(numbers) in (12, 16):
@@ -86,6 +90,8 @@ def pose_of_text(text: str) -> ArmPose:
             f"A pose has 6 numbers (position and three angles), 7 (with a quaternion), or 12 or 16 (a matrix), and"
             f" '{' '.join(text.split())[:60]}' holds {len(numbers)}."
         )
+    if max(map(abs, numbers)) > _FARTHEST:
+        raise NoPose(f"'{max(numbers, key=abs):g}' is beyond any arm: copy the pose again.")
     return ArmPose(numbers=numbers)
 
 

@@ -19,9 +19,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.figures.hand_eye.guidance import CAPTURES, at_random, error_m, looked_at
 from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.capture.session import POSES_FILE, ArmPose, Capture, CaptureSession, jog
-from weldcal.calibration.capture.tasks import BoardTask, FlangeTask
+from weldcal.calibration.capture.tasks import BoardTask, FlangeTask, next_scan
 from weldcal.calibration.data.clouds import read_cloud, save_cloud
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.recorded_flange import calibrate_flange
@@ -180,6 +181,44 @@ def test_typed_poses_in_millimetres_and_degrees_are_read_by_what_the_scans_show(
     assert np.linalg.norm(verdict.X.translation() - cell.X_BC.translation()) < 5e-4
 
 
+def test_the_result_in_use_is_judged_by_new_captures(tmp_path: Path, cell: DemoCell) -> None:
+    """A right one by less than a tenth of a millimetre; after a knock of the scanner by about what it was."""
+    one = session(tmp_path / "s" / "captures")
+    for move in MOVES:
+        assert not take(one, cell, tmp_path).refused
+        cell.jog(move, None)
+    one.task.save(one.folder)
+    checked, error = one.check(cell.take(tmp_path), cell.pose())
+    assert not checked.refused
+    assert error < 1e-4
+    assert (tmp_path / "s" / "calibration" / "calibration.yaml").is_file()
+    cell.jog("+y", None)
+    cell.X_BC = RigidTransform([0.003, 0.0, 0.0]) @ cell.X_BC
+    assert one.check(cell.take(tmp_path), cell.pose())[1] == pytest.approx(3e-3, abs=2e-4)
+    assert len(one.captures) == len(MOVES), "what judges is not what calibrates"
+
+
+def test_a_session_of_another_kind_is_refused_and_left_as_it_is(begun: CaptureSession) -> None:
+    before = sorted(p.name for p in begun.folder.rglob("*"))
+    with pytest.raises(InputError, match="is a session of clouds, and these are pictures"):
+        CaptureSession(begun.folder, BoardTask(BOARD, "eye_in_hand"))
+    assert sorted(p.name for p in begun.folder.rglob("*")) == before
+
+
+def test_a_pose_whose_scan_was_refused_is_not_proposed_again(
+    begun: CaptureSession, cell: DemoCell, tmp_path: Path
+) -> None:
+    assert not take(begun, cell, tmp_path).refused
+    first = begun.verdict().advice
+    assert first is not None
+    assert first.X_BF is not None
+    cell.jog("next", first.X_BF)
+    assert begun.take(wrong_scan(cell, tmp_path, "nothing there"), cell.pose()).refused
+    second = begun.verdict().advice
+    assert second is not None
+    assert max(ArmPose(X_BF=first.X_BF).moved(ArmPose(X_BF=second.X_BF))) > 0.05
+
+
 def test_a_capture_is_taken_back(begun: CaptureSession, cell: DemoCell, tmp_path: Path) -> None:
     begun.take_back("002")
     assert [c.id for c in begun.captures] == ["001", "003"]
@@ -232,12 +271,30 @@ def test_the_odd_one_out_is_named(tmp_path: Path) -> None:
     """Real scans of an AUBO i5; one pose is 4 mm off, which no pair of captures shows by itself."""
     require_data(SHARED_DATA)
     data = load_dataset(SHARED_DATA / "flange" / "aubo_i5_phoxi_s")
-    one = CaptureSession(tmp_path, FlangeTask("aubo_i5", data.header.flange))
+    one = CaptureSession(tmp_path / "s" / "captures", FlangeTask("aubo_i5", data.header.flange))
     for k, id in enumerate(list(data.clouds)[:9]):
         X = data.poses[id]
         wrong = RigidTransform(X.rotation(), X.translation() + np.array([0.0, 0.004, 0.0]))
         assert not one.take(data.clouds[id], ArmPose(X_BF=wrong if k == 5 else X)).refused
     assert [id for id, _ in one.verdict().odd] == ["006"]
+
+
+def test_the_advice_is_worth_more_than_poses_at_random() -> None:
+    """By the rms error of a formula of the figure's own, with noise of scans and arm and an unknown centre."""
+    for seed in range(3):
+        rng, seen = np.random.default_rng(seed), []
+        X_BC = RigidTransform(RollPitchYaw(np.pi, 0.1, seed), [0.5, 0.0, 1.2])
+        for _ in range(3):
+            seen.append(looked_at(X_BC, at_random(rng, 0.5), np.zeros(3), rng))
+        while len(seen) < CAPTURES:
+            advice = next_scan(seen, X_BC, RigidTransform(), "", ArmPose())
+            assert advice is not None
+            assert advice.X_BF is not None
+            assert advice.sigma_after_m < advice.sigma_before_m
+            seen.append(looked_at(X_BC, X_BC.inverse() @ advice.X_BF, np.zeros(3), rng))
+        guided = error_m([X_BC.inverse() @ o.X_BR for o in seen], X_BC)
+        others = [error_m([at_random(rng, 0.5) for _ in range(CAPTURES)], X_BC) for _ in range(200)]
+        assert guided < 0.85 * float(np.median(others))
 
 
 def test_a_jog_is_said_as_a_person_does_it() -> None:

@@ -16,6 +16,7 @@ from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.arm_poses import KINDS, ArmSource, arm_source
 from weldcal.tools import console
 from weldcal.tools.cli.options import LOOK, Call, command, option, switch
+from weldcal.tools.cli.result_folder import claimed
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
 from weldcal.tools.dashboard.capture_run import CaptureRun, DriverSensor, FolderSensor, Sensor
 from weldcal.tools.dashboard.capture_run import webcam as opened_webcam
@@ -25,6 +26,7 @@ PERIOD_S = 0.5
 
 @command(
     "capture",
+    keys=("intrinsics",),
     options=("browser", "seed"),
     common=LOOK,
     short_help="Capture by hand: each scan or picture is judged at once.",
@@ -47,7 +49,9 @@ def capture(
     ] = "eye_in_hand",
     robot: Annotated[str, option("--robot", "NAME", "The arm, such as ur10e.")] = "",
     flange: Annotated[str, option("--flange", "NAME", "The flange, where the arm's own does not say.")] = "",
-    required_mm: Annotated[float, option("--required-mm", "MM", "The error at the work point that is wanted.")] = 0.2,
+    required_mm: Annotated[
+        float, option("--required-mm", "MM", "The error at the work point that is wanted.", min=0.001)
+    ] = 0.2,
     demo: Annotated[
         bool, switch("--demo", "With an emulated arm and scanner; the page's buttons jog the arm.")
     ] = False,
@@ -55,18 +59,31 @@ def capture(
 ) -> dict[str, object]:
     """Take scans of the flange, or pictures of a board, by hand; the page judges each and proposes the next pose.
 
-    Nothing is sent to the robot. All captures are in the folder of --out, which `weldcal calibrate` or `weldcal
-    hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
+    Nothing is sent to the robot. All captures are in `captures` of --out, which `weldcal calibrate` or
+    `weldcal hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
     """
+    if mounting not in ("eye_in_hand", "eye_on_base"):
+        raise InputError(f"--mounting must be eye_in_hand (on the flange) or eye_on_base, not '{mounting}'.")
+    if demo and (scenario or watch or webcam or poses or board):
+        raise InputError("--demo brings its own arm and scanner: leave out the sensor, --poses and --board.")
     cell = DemoCell(call.seed) if demo else None
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
-    task: CaptureTask = BoardTask(board, mounting, robot) if board else FlangeTask(robot, flange or _flange_of(robot))
-    run = CaptureRun(CaptureSession(out, task), arm, sensor, required_mm, "weldcal capture")
-    with closing(run):
+    task: CaptureTask = (
+        BoardTask(board, mounting, robot, call.reading.get("intrinsics"))
+        if board
+        else FlangeTask(robot, flange or _flange_of(robot))
+    )
+    run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
+    with claimed(out, overwrite=True), closing(run):
         _serve(run, call.live["browser"])
-    return {"state": "done", "folder": str(out), "captures": len(run.session.captures), "next": task.command(out)}
+    return {
+        "state": "done",
+        "folder": str(out),
+        "captures": len(run.session.captures),
+        "next": task.command(run.session.folder) if run.session.captures else "nothing was captured",
+    }
 
 
 def _serve(run: CaptureRun, browser: bool) -> None:

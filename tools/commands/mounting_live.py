@@ -1,41 +1,22 @@
-"""Runs `weldcal hand-eye live`, a calibration in any mounting, and `weldcal calibrate` on its recorded scans."""
+"""Runs a scenario that calibrates in any mounting, and `weldcal calibrate` on its recorded scans."""
 
 import json
 import time
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.recorded_carried import calibrate_carried
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.systems.scenario.loading import load_scenario, scenario_text
+from weldcal.systems.scenario.loading import scenario_text
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, command
-from weldcal.tools.commands.run import JobRun, run_job, run_options, save_scans
+from weldcal.tools.commands.run import JobRun, run_job, save_scans
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.mounting import MountingReport, mounting_report, station_picture
 from weldcal.tools.report.render import csv_text, write_atomic
 from weldcal.tools.report.run import RunOptions
-
-
-@command(
-    "hand-eye live", short_help="Calibrate a scanner live in any mounting.", options=LIVE, defaults={"browser": False}
-)
-def hand_eye_live(
-    call: Call,
-    scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="A scenario with a mounting section, by name or path.")
-    ] = "eye_in_hand",
-    record: RecordOption = False,
-) -> Outcome:
-    """Calibrate a scanner live in any mounting: it scans the robot's flange, its foot, or a second arm's flange."""
-    options = run_options(call, "hand-eye", scenario, recording=record)
-    result = run_mounting_live(load_scenario(scenario), options, call.progress)
-    return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
 def calibrate_recorded(

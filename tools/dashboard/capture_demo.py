@@ -14,6 +14,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.shape import arm_shape
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh, get_flange
+from weldcal.models.mesh import TriMesh
 from weldcal.models.robots import get_robot
 from weldcal.models.scanners import cast, get_scanner
 
@@ -40,7 +41,7 @@ class DemoCell:
         self._flange = flange_mesh(get_flange(get_robot(ROBOT).flange))
         q = nearest_solution(self._arm, _GUESS @ START_CF, HOME)
         assert q is not None
-        self._q = q
+        self._q = self._home = q
         self._scans = seed
 
     def pose(self) -> ArmPose:
@@ -50,6 +51,9 @@ class DemoCell:
     def jog(self, name: str, goal: RigidTransform | None) -> None:
         """See JoggedArm. Raises InputError where the arm cannot reach."""
         X_BF = forward_kinematics(self._arm, self._q)
+        if name == "home":
+            self._q = self._home
+            return
         if name != "next":
             sign, axis = (-1.0 if name[0] == "-" else 1.0), "xyz".index(name[-1])
             step = sign * np.eye(3)[axis]
@@ -57,18 +61,21 @@ class DemoCell:
             shift = np.zeros(3) if "r" in name else STEP_M * step
             goal = RigidTransform(R @ X_BF.rotation(), X_BF.translation() + shift)
         if goal is None:
-            raise InputError("There is no next pose yet: take three captures first.")
+            raise InputError("There is no next pose yet: move the flange, tilt it, and capture.")
         q = nearest_solution(self._arm, goal, self._q)
         if q is None:
             raise InputError("The arm does not reach that pose: jog elsewhere.")
         self._q = q
 
+    def shape(self) -> list[TriMesh]:
+        """The arm in the base, as the 3D view shows it."""
+        return [mesh.transformed(body.X_BL) for body in arm_shape(self._arm, self._q) for mesh in body.meshes]
+
     def take(self, folder: Path) -> Path:
         """See Sensor."""
         self._scans += 1
         X_BF = forward_kinematics(self._arm, self._q)
-        meshes = [mesh.transformed(body.X_BL) for body in arm_shape(self._arm, self._q) for mesh in body.meshes]
-        points_B = cast([*meshes, self._flange.transformed(X_BF)], self.X_BC, self._scanner, self._scans)
+        points_B = cast([*self.shape(), self._flange.transformed(X_BF)], self.X_BC, self._scanner, self._scans)
         X_CB = self.X_BC.inverse()
         save_cloud(folder / "scan.npz", points_B @ X_CB.rotation().matrix().T + X_CB.translation())
         return folder / "scan.npz"

@@ -6,6 +6,7 @@ import tempfile
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, runtime_checkable
@@ -14,11 +15,12 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.capture.session import ArmPose, Capture, CaptureSession, CaptureVerdict, ur_pose
+from weldcal.calibration.capture.session import RESULT, ArmPose, Capture, CaptureSession, CaptureVerdict, ur_pose
 from weldcal.calibration.data.clouds import SUFFIXES, CloudError, read_cloud, save_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
 from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.mesh import TriMesh
 from weldcal.systems.drivers.arm_poses import ArmSource, TypedPose
 from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.folder_source import NewFiles
@@ -48,6 +50,9 @@ class Sensor(Protocol):
 @runtime_checkable
 class JoggedArm(Protocol):
     """An emulated arm that the page's buttons jog."""
+
+    def shape(self) -> list[TriMesh]:
+        """The arm in the base, as the 3D view shows it."""
 
     def jog(self, name: str, goal: RigidTransform | None) -> None:
         """Move a step along or about an axis of the base ("+x", "-rz"), or to a goal ("next"). Raises WeldcalError."""
@@ -101,15 +106,20 @@ class FolderSensor:
         return bool(self._new)
 
     def take(self, folder: Path) -> Path:
-        """See Sensor."""
+        """See Sensor. A file from before the call may be of another pose: it does not count."""
+        self._files.start()
+        self._new = []
         until = time.monotonic() + ANSWER_S
         while not self.fresh():
             if time.monotonic() > until:
-                raise SensorError(f"No new file came within {ANSWER_S:g} s: scan with the sensor's program.")
+                raise SensorError(f"No new file came within {ANSWER_S:g} s after Capture: press it, then scan.")
             time.sleep(0.05)
-        newest = self._new[-1]
-        self._new = []
-        return newest
+        return self.newest()
+
+    def newest(self) -> Path:
+        """Return the newest file that ``fresh`` found, and leave out the others."""
+        found, self._new = self._new[-1], []
+        return found
 
     def close(self) -> None:
         """See Sensor."""
@@ -196,6 +206,7 @@ class CaptureRun:
             "title": self.title,
             "arm": self.arm.words,
             "sensor": self.sensor.words,
+            "waits": isinstance(self.sensor, FolderSensor),
             "typed": isinstance(self.arm, TypedPose),
             "jogs": isinstance(self.arm, JoggedArm),
             "by_itself": self.by_itself,
@@ -209,9 +220,10 @@ class CaptureRun:
             "required_mm": self.required_mm,
             "said": list(v.said),
             "advice": None if v.advice is None else v.advice.words,
-            "advice_mm": None if v.advice is None else round(1e3 * v.advice.sigma_after_m, 3),
+            "gain": None if v.advice is None else 1.0 - v.advice.sigma_after_m / max(v.advice.sigma_before_m, 1e-9),
             "ur_pose": None if v.advice is None or v.advice.X_BF is None else ur_pose(v.advice.X_BF),
             "checks": self.checks,
+            "result": str((self.session.folder.parent / RESULT).absolute()),
             "used": self.used,
             "folder": str(self.session.folder.absolute()),
             "command": self.session.task.command(self.session.folder),
@@ -225,7 +237,7 @@ class CaptureRun:
                 wish = self._wishes.get(timeout=LOOK_S)
             watched = self.by_itself and not isinstance(self.arm, TypedPose)
             if not wish and watched and isinstance(self.sensor, FolderSensor):
-                wish = "capture" if self.sensor.fresh() else ""
+                wish = "file" if self.sensor.fresh() else ""
             elif not wish and watched:
                 with suppress(WeldcalError):
                     now = self.arm.pose()
@@ -250,23 +262,25 @@ class CaptureRun:
             goal = None if self.verdict.advice is None else self.verdict.advice.X_BF
             self.arm.jog(wish.removeprefix("jog-"), goal)
             return
-        if wish == "capture":
+        if wish in ("capture", "file"):
             self.state = TAKING
-            self._capture()
+            self._capture(wish == "file")
         elif wish.startswith("back-"):
             self.session.take_back(wish.removeprefix("back-"))
         elif wish == "use":
             self.session.task.save(self.session.folder)
-            self.used = True
+            self.used, self.verdict, self.last = True, replace(self.verdict, advice=None), None
             return
         self.state = THINKING
         if not self.used:
             self.verdict = self.session.verdict()
 
-    def _capture(self) -> None:
+    def _capture(self, came: bool) -> None:
+        """Take one capture; ``came``: the file of the sensor is there already."""
         before = self.arm.pose()
         with tempfile.TemporaryDirectory(dir=self._scratch.name) as scratch:
-            file = self.sensor.take(Path(scratch))
+            file = self.sensor.newest() if came and isinstance(self.sensor, FolderSensor) else None
+            file = file or self.sensor.take(Path(scratch))
             after = None if isinstance(self.arm, TypedPose) else self.arm.pose()
             if self.used:
                 one, error = self.session.check(file, before, after)

@@ -13,13 +13,14 @@ from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.dashboard.capture_run import CaptureRun
+from weldcal.tools.dashboard.capture_run import CaptureRun, JoggedArm
 
 POINTS = 20_000
 """Points that are drawn of each scan."""
 _AXIS_M = 0.08
 _COLOURS = ((1.0, 0.0, 0.0), (0.0, 0.6, 0.0), (0.0, 0.3, 1.0))
 _FROM_M = np.array([0.9, -0.9, 0.7])  # from where the camera looks at the first pose
+_ARM = Rgba(0.75, 0.78, 0.8, 0.6)
 _GHOST = Rgba(0.45, 0.25, 0.75, 0.9)
 
 
@@ -34,6 +35,9 @@ class CaptureView:
 
     def show(self, run: CaptureRun) -> None:
         """Draw the session as it is."""
+        if isinstance(run.arm, JoggedArm):
+            for k, mesh in enumerate(run.arm.shape()):
+                self._meshcat.SetTriangleMesh(f"arm/{k}", mesh.vertices.T, mesh.triangles.T, _ARM)
         verdict, taken = run.verdict, {c.id: c for c in run.session.captures}
         for id in self._drawn - set(taken):
             self._meshcat.Delete(f"taken/{id}")

@@ -21,10 +21,10 @@ TEXT = "chessboard:9x6:20"
 @pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_on_base"])
 def test_the_camera_s_pose_and_what_to_do_next_after_each_picture(tmp_path: Path, mounting: str) -> None:
     drawing, rng = BOARDS[TEXT], np.random.default_rng(8)
-    truth = draw.world(drawing, 8, 9, eye_in_hand=mounting == "eye_in_hand")
+    truth = draw.world(drawing, 8, 11, eye_in_hand=mounting == "eye_in_hand")
     one = CaptureSession(tmp_path / "s", BoardTask(TEXT, mounting))
     seen = []
-    for C, M in zip(truth.camera, truth.robot, strict=True):
+    for C, M in list(zip(truth.camera, truth.robot, strict=True))[:9]:
         cv2.imwrite(str(tmp_path / "shot.png"), draw.render(drawing, C, rng, sub=2))
         X = RigidTransform(M)
         assert not one.take(tmp_path / "shot.png", ArmPose(X_BF=X)).refused
@@ -40,6 +40,12 @@ def test_the_camera_s_pose_and_what_to_do_next_after_each_picture(tmp_path: Path
     asked = HandEyeOptions(board=TEXT, mounting=mounting, corners=None)
     again = calibrate_recorded(one.folder, asked).result.X
     assert again.IsNearlyEqualTo(last.X, 1e-12), "as hand-eye gives it; OpenCV's threads add in another order"
+    one.task.save(one.folder)
+    for C, M in list(zip(truth.camera, truth.robot, strict=True))[9:]:
+        cv2.imwrite(str(tmp_path / "shot.png"), draw.render(drawing, C, rng, sub=2))
+        checked, error = one.check(tmp_path / "shot.png", ArmPose(X_BF=RigidTransform(M)))
+        assert not checked.refused
+        assert error < 1.5e-3
     resumed = CaptureSession(one.folder, BoardTask(TEXT, mounting))
     assert len(resumed.captures) == 9
     X_again = resumed.verdict().X

@@ -31,6 +31,7 @@ SIX = (400.1, -20.25, 300.0, 179.5, 0.25, -90.0)
         "{X 400.1,Y -20.25,Z 300,A 179.5,B 0.25,C -90}",
         "X=400.1\tY=-20.25\tZ=300.0\tW=179.5\tP=0.25\tR=-90.0",
         "400,1; -20,25; 300; 179,5; 0,25; -90",
+        "400,1 -20,25 300,0 179,5 0,25 -90,0",
         "(400.1mm,-20.25mm,300.0mm,179.5deg,0.25deg,-90.0deg)",
         "4.001e2 -2.025E1 3e2 1.795e+2 2.5e-1 -9e1",
         "[[400.1,-20.25,300],[179.5,.25,-90.]]",
@@ -61,6 +62,11 @@ def test_a_matrix_is_a_pose_whichever_way_it_is_printed() -> None:
 def test_a_text_without_a_pose_says_how_many_numbers_it_holds(text: str) -> None:
     with pytest.raises(NoPose, match=f"holds {len(text.split()) if text[:1].isdigit() else 0}"):
         pose_of_text(text)
+
+
+def test_a_number_beyond_any_arm_is_refused() -> None:
+    with pytest.raises(NoPose, match=r"'1e\+07' is beyond any arm"):
+        pose_of_text("10000000 0 0 0 0 0")
 
 
 @pytest.mark.parametrize("text", ["ur:", "tcp:x", "tcp:99999", "file:", "command:", "rtde", "driver:"])

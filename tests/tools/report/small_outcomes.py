@@ -272,7 +272,7 @@ def _run(name: str, **job: Any) -> Any:
 
 
 def mounting() -> Made:
-    """`hand-eye live`, without ground truth."""
+    """a live mounting, without ground truth."""
     world = mounted_world("eye_in_hand", 0, scans=9)
     status = CarriedCalibration(
         seen=tuple(world.seen),
