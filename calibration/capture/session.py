@@ -155,7 +155,8 @@ class CaptureTask(Protocol):
 class CaptureSession:
     """A folder of captures that grows: each is whole on disk before the next begins, and a new start goes on with it.
 
-    A capture is its file, and then its row in the table of poses; a file without a row is not a capture.
+    A capture is its hidden file, then its row in the table of poses, then the file's name: whenever this ends, the folder
+    calibrates, and a row finds its file.
     """
 
     def __init__(self, folder: Path, task: CaptureTask) -> None:
@@ -167,7 +168,12 @@ class CaptureSession:
             raise InputError(f"'{folder}' is a session of {other}, and these are {task.folder}: name another folder.")
         (folder / task.folder).mkdir(parents=True, exist_ok=True)
         rows = self._rows()
-        files = {cloud_id(p): p for p in (folder / task.folder).iterdir() if not p.name.startswith(".")}
+        for hidden in (folder / task.folder).glob(".*"):
+            if any(row["id"] == cloud_id(hidden.with_name(hidden.name[1:])) for row in rows):
+                hidden.replace(hidden.with_name(hidden.name[1:]))
+            else:
+                hidden.unlink()
+        files = {cloud_id(p): p for p in (folder / task.folder).iterdir()}
         for row in rows:
             id, pose = row["id"], _pose_of(row)
             if id in files:
@@ -190,21 +196,19 @@ class CaptureSession:
         one = Capture(id=id, file=kept, pose=pose)
         if why := self._repeats(one, source) or _not_at_rest(pose, after):
             return replace(one, refused=why)
-        unfinished = kept.with_name(f".{kept.name}")
-        shutil.copyfile(source, unfinished)
-        try:
-            found, why = self.task.look(id, unfinished)
-        finally:
-            unfinished.replace(kept)
+        hidden = kept.with_name(f".{kept.name}")
+        shutil.copyfile(source, hidden)
+        found, why = self.task.look(id, hidden)
         one = replace(one, found=found)
         if not why:
             against = [said for other in self.captures if (said := self.task.contradicts(other, one))]
             why = against[-1] if 2 * len(against) > len(self.captures) else ""
         if why:
-            kept.unlink()
+            hidden.unlink()
             self.task.forget(id, pose)
             return replace(one, refused=why)
         self._write([*self.captures, one])
+        hidden.replace(kept)
         return one
 
     def take_back(self, id: str) -> None:
