@@ -155,8 +155,8 @@ class CaptureTask(Protocol):
 class CaptureSession:
     """A folder of captures that grows: each is whole on disk before the next begins, and a new start goes on with it.
 
-    A capture is its hidden file, then its row in the table of poses, then the file's name: whenever this ends, the folder
-    calibrates, and a row finds its file.
+    A capture is its hidden file, then its row in the table of poses, then the file's name: whenever this ends, the
+    folder calibrates, and a row finds its file.
     """
 
     def __init__(self, folder: Path, task: CaptureTask) -> None:
@@ -165,7 +165,7 @@ class CaptureSession:
         self._checks: CaptureSession | None = None
         other = next((name for name in FOLDERS if name != task.folder and (folder / name).is_dir()), None)
         if other is not None:
-            raise InputError(f"'{folder}' is a session of {other}, and these are {task.folder}: name another folder.")
+            raise InputError(f"'{folder}' is a session of {other}, not of {task.folder}: name another folder.")
         (folder / task.folder).mkdir(parents=True, exist_ok=True)
         rows = self._rows()
         for hidden in (folder / task.folder).glob(".*"):

@@ -200,7 +200,7 @@ def test_the_result_in_use_is_judged_by_new_captures(tmp_path: Path, cell: DemoC
 
 def test_a_session_of_another_kind_is_refused_and_left_as_it_is(begun: CaptureSession) -> None:
     before = sorted(p.name for p in begun.folder.rglob("*"))
-    with pytest.raises(InputError, match="is a session of clouds, and these are pictures"):
+    with pytest.raises(InputError, match="is a session of clouds, not of pictures"):
         CaptureSession(begun.folder, BoardTask(BOARD, "eye_in_hand"))
     assert sorted(p.name for p in begun.folder.rglob("*")) == before
 
