@@ -94,7 +94,7 @@ class ShortJobs:
             kept.append(run_scenario(short_job_scenario(), options, progress))
             return kept[0]
 
-        words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._folder), "--json"]
+        words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._folder), "--overwrite", "--json"]
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr("weldcal.tools.commands.weld.run_scenario", short)
             finished = CliRunner().invoke(app, words)
