@@ -60,12 +60,9 @@ class ArmPose:
             joints = [] if self.q is None else [f"q{k + 1}" for k in range(len(self.q))]
             return ["x", "y", "z", "qw", "qx", "qy", "qz", *joints]
         known = {6: ["x", "y", "z", "rx", "ry", "rz"], 7: ["x", "y", "z", "q1", "q2", "q3", "q4"]}
-        if len(self.numbers) == 16 or len(self.numbers) == 12:
-            return [f"r{k}" for k in range(len(self.numbers))]
         if len(self.numbers) not in known:
             raise InputError(
-                f"A pose has 6 numbers (position and three angles), 7 (with a quaternion), 12 or 16 (a matrix); these"
-                f" are {len(self.numbers)}."
+                f"A pose has 6 numbers (position and three angles) or 7 (with a quaternion); these are {len(self.numbers)}."
             )
         return known[len(self.numbers)]
 
@@ -99,6 +96,11 @@ class Advice:
     words: str
     sigma_before_m: float
     sigma_after_m: float
+
+    @property
+    def gain(self) -> float | None:
+        """The share by which it lowers the uncertainty; None where this is open before."""
+        return 1.0 - self.sigma_after_m / self.sigma_before_m if 0.0 < self.sigma_before_m < np.inf else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -22,7 +22,7 @@ from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.systems.drivers.arm_poses import ArmSource, TypedPose
-from weldcal.systems.drivers.sensors.acquisition import Source
+from weldcal.systems.drivers.sensors.acquisition import DeviceLost, Source
 from weldcal.systems.drivers.sensors.folder_source import NewFiles
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.tools.dashboard.source import WIDTH_PX, depth_picture, png
@@ -70,18 +70,23 @@ class DriverSensor:
 
     def take(self, folder: Path) -> Path:
         """See Sensor."""
-        if not self._open:
-            self._source.open()
-            self._open = True
-        while self._source.next(0.0) is not None:
-            pass  # what came before the button
-        self._asked += 1
-        self._source.ask(self._asked)
-        until = time.monotonic() + ANSWER_S
-        while time.monotonic() < until:
-            got = self._source.next(LOOK_S)
-            if got is not None:
-                return _written(got.datum, folder)
+        try:
+            if not self._open:
+                self._source.open()
+                self._open = True
+            while self._source.next(0.0) is not None:
+                pass  # what came before the button
+            self._asked += 1
+            self._source.ask(self._asked)
+            until = time.monotonic() + ANSWER_S
+            while time.monotonic() < until:
+                got = self._source.next(LOOK_S)
+                if got is not None:
+                    return _written(got.datum, folder)
+        except DeviceLost:  # the next capture opens it again
+            self._source.close()
+            self._open = False
+            raise
         raise SensorError(f"{self.words} sent nothing within {ANSWER_S:g} s: trigger it, or check its cable.")
 
     def close(self) -> None:
@@ -220,7 +225,7 @@ class CaptureRun:
             "required_mm": self.required_mm,
             "said": list(v.said),
             "advice": None if v.advice is None else v.advice.words,
-            "gain": None if v.advice is None else 1.0 - v.advice.sigma_after_m / max(v.advice.sigma_before_m, 1e-9),
+            "gain": None if v.advice is None else v.advice.gain,
             "ur_pose": None if v.advice is None or v.advice.X_BF is None else ur_pose(v.advice.X_BF),
             "checks": self.checks,
             "result": str((self.session.folder.parent / RESULT).absolute()),

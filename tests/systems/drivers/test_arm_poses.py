@@ -13,6 +13,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.hardware.emulator_process import Emulator, emulator  # noqa: F401
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers import arm_poses
 from weldcal.systems.drivers.arm_poses import ArmSource, NoPose, TypedPose, UrPose, arm_source, pose_of_text
@@ -174,12 +175,17 @@ def test_a_ur_is_only_read(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(SocketLine, "send", noted)
     source = UrPose(emulator.host)
-    found = [source.pose() for _ in range(3)]
+    found = [source.pose() for _ in range(2)]
+    emulator.fault("wrong_tcp")  # 100 mm along z
+    found.append(source.pose())
     source.close()
     assert set(kinds) <= set("VvOSP")
     assert found[0].q is not None
     assert len(found[0].q) == 6
     assert max(found[0].moved(found[2])) < 1e-6
+    assert found[0].X_BF is not None
+    flange = forward_kinematics(load_arm("ur10e"), found[0].q)
+    assert flange.IsNearlyEqualTo(found[0].X_BF, 1e-5), "by the arm's own kinematics"
     source = UrPose("127.0.0.9")
     with pytest.raises(NoPose):
         source.pose()

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.browser import Browser
-from weldcal.calibration.capture.session import CaptureSession
+from weldcal.calibration.capture.session import Advice, CaptureSession, CaptureVerdict
 from weldcal.calibration.capture.tasks import FlangeTask
+from weldcal.calibration.data.clouds import read_cloud
+from weldcal.calibration.hand_eye.pictures.search import load_grey
 from weldcal.calibration.recorded_flange import calibrate_flange
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
-from weldcal.tools.dashboard.capture_run import READY, CaptureRun, FolderSensor
+from weldcal.tools.dashboard.capture_run import READY, CaptureRun, DriverSensor, FolderSensor, webcam
 from weldcal.tools.dashboard.capture_view import CaptureView
 from weldcal.tools.dashboard.server import Dashboard
 
@@ -51,10 +57,9 @@ def test_a_person_reaches_a_calibration_by_the_page_alone(run: CaptureRun, brows
             until(lambda k=k: len(run.session.captures) == k + 1 and run.state == READY)  # type: ignore[misc]
             view.show(run)
             name = "to the next pose" if move == "next" else f"turn {move.replace('r', '')}" if "r" in move else move
-            browser.run(f"[...document.querySelectorAll('#jogs button')].find(b => b.textContent === '{name}').click()")
             before = cell.pose()
-            until(lambda before=before: max(cell.pose().moved(before)) >= 0.0)  # type: ignore[misc]
-            time.sleep(0.4)
+            browser.run(f"[...document.querySelectorAll('#jogs button')].find(b => b.textContent === '{name}').click()")
+            until(lambda before=before: max(cell.pose().moved(before)) > 1e-6)  # type: ignore[misc]
         assert run.problem == ""
         browser.screenshot(tmp_path / "page.png")
     assert run.verdict.X is not None
@@ -97,3 +102,42 @@ def test_space_captures_wherever_the_focus_is(run: CaptureRun, browser: Browser)
         time.sleep(0.5)
         assert browser.run("return document.documentElement.scrollWidth") == 390
         browser.resize(1280, 800)
+
+
+def test_the_scanner_of_a_driver_gives_its_scan(tmp_path: Path) -> None:
+    """The driver of a folder, as a scenario names it."""
+    (tmp_path / "in").mkdir()
+    sensor, cell = DriverSensor(FolderScanner(folder=str(tmp_path / "in")).source(), "FolderScanner"), DemoCell(1)
+    done: list[Path] = []
+    waiting = threading.Thread(target=lambda: done.append(sensor.take(tmp_path / "out")))
+    (tmp_path / "out").mkdir()
+    waiting.start()
+    time.sleep(0.5)
+    scan = cell.take(tmp_path).rename(tmp_path / "in" / "new.npz")
+    waiting.join(10.0)
+    sensor.close()
+    np.testing.assert_allclose(read_cloud(done[0]), read_cloud(scan), atol=1e-6)
+
+
+def test_a_camera_gives_a_picture_and_one_that_is_absent_a_sentence(tmp_path: Path) -> None:
+    """A video file stands for the camera: OpenCV reads both alike."""
+    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
+    for k in range(60):
+        film.write(np.full((240, 320, 3), 40 + k, np.uint8))
+    film.release()
+    sensor = webcam(str(tmp_path / "film.avi"))
+    grey = load_grey(sensor.take(tmp_path))
+    sensor.close()
+    assert grey is not None
+    assert grey.shape == (240, 320)
+    with pytest.raises(InputError, match="cannot be opened"):
+        webcam(str(tmp_path / "none.avi"))
+
+
+def test_an_open_direction_does_not_stop_the_page(run: CaptureRun) -> None:
+    """Uncertainties without end are no numbers of JSON."""
+    for before, after in ((np.inf, np.inf), (np.inf, 1e-3), (2e-3, 1e-3)):
+        advice = Advice(X_BF=None, words="", sigma_before_m=before, sigma_after_m=after)
+        run.verdict = CaptureVerdict(symbol="X_BC", said=(), advice=advice)
+        gain = json.loads(json.dumps(run.values(), allow_nan=False))["gain"]
+        assert gain == (0.5 if before == 2e-3 else None)
