@@ -62,7 +62,8 @@ class ArmPose:
         known = {6: ["x", "y", "z", "rx", "ry", "rz"], 7: ["x", "y", "z", "q1", "q2", "q3", "q4"]}
         if len(self.numbers) not in known:
             raise InputError(
-                f"A pose has 6 numbers (position and three angles) or 7 (with a quaternion); these are {len(self.numbers)}."
+                "A pose has 6 numbers (position and three angles) or 7 (with a quaternion); these are"
+                f" {len(self.numbers)}."
             )
         return known[len(self.numbers)]
 

@@ -14,7 +14,7 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
-    "code lines of calibration": 31_191,
+    "code lines of calibration": 31_192,
     "code lines of models": 6_466,
     "code lines of systems": 19_409,
     "code lines of tools": 23_032,
