@@ -91,10 +91,14 @@ class Capture:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Advice:
-    """The next pose: the flange X_BF (None: the mounting leaves it open), in words, and what it gains (m)."""
+    """The next pose, in words, and what it gains (m).
+
+    ``X_BF``: of the flange (None: the mounting leaves it open); ``q`` (6,) rad: where only these joints do.
+    """
 
     X_BF: RigidTransform | None
     words: str
+    q: Array | None = None
     sigma_before_m: float
     sigma_after_m: float
 
@@ -103,13 +107,21 @@ class Advice:
         """The share by which it lowers the uncertainty; None where this is open before."""
         return 1.0 - self.sigma_after_m / self.sigma_before_m if 0.0 < self.sigma_before_m < np.inf else None
 
+    @property
+    def ur(self) -> str | None:
+        """The pose, or the joints, as URScript has them."""
+        if self.q is not None:
+            return "[" + ", ".join(f"{v:.5f}" for v in self.q) + "]"
+        return None if self.X_BF is None else ur_pose(self.X_BF)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaptureVerdict:
     """What the captures say together.
 
     ``X`` the scanner's or camera's pose (None: not yet), its error at the work point with 95 %, what is still open or
-    wrong in sentences, the captures that disagree with the others (id, reason), and the next pose.
+    wrong in sentences, the captures that disagree with the others (id, reason), and the next pose. ``placed``: X_BC of
+    each scan (its id), and how far it lies from where the others put it (m).
     """
 
     symbol: str
@@ -118,6 +130,7 @@ class CaptureVerdict:
     error_95_m: float | None = None
     odd: tuple[tuple[str, str], ...] = ()
     advice: Advice | None = None
+    placed: tuple[tuple[str, RigidTransform, float], ...] = ()
 
 
 class CaptureTask(Protocol):
@@ -130,8 +143,8 @@ class CaptureTask(Protocol):
     def prepare(self, folder: Path) -> None:
         """Write what the folder needs besides captures."""
 
-    def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
-        """Return what a file shows, and why it cannot be used ("": it can)."""
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
+        """Return what a file shows, taken at a pose, and why it cannot be used ("": it can)."""
 
     def contradicts(self, one: Capture, other: Capture) -> str:
         """Say how the move from one capture to the other contradicts that of the arm; "" where it does not."""
@@ -141,6 +154,9 @@ class CaptureTask(Protocol):
 
     def fresh(self) -> CaptureTask:
         """Return the same task, with nothing found yet."""
+
+    def first_pose(self, last: ArmPose | None) -> Advice | None:
+        """Return where to begin, and what comes next before there is a result; None where any pose will do."""
 
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """Calibrate. Raises WeldcalError as the command of this folder does."""
@@ -180,7 +196,7 @@ class CaptureSession:
         for row in rows:
             id, pose = row["id"], _pose_of(row)
             if id in files:
-                self.captures.append(Capture(id=id, file=files[id], pose=pose, found=task.look(id, files[id])[0]))
+                self.captures.append(Capture(id=id, file=files[id], pose=pose, found=task.look(id, files[id], pose)[0]))
         task.prepare(folder)
 
     def take(self, source: Path, pose: ArmPose, after: ArmPose | None = None) -> Capture:
@@ -201,7 +217,7 @@ class CaptureSession:
             return replace(one, refused=why)
         hidden = kept.with_name(f".{kept.name}")
         shutil.copyfile(source, hidden)
-        found, why = self.task.look(id, hidden)
+        found, why = self.task.look(id, hidden, pose)
         one = replace(one, found=found)
         if not why:
             against = [said for other in self.captures if (said := self.task.contradicts(other, one))]
@@ -230,7 +246,9 @@ class CaptureSession:
         if len(self.captures) < least:
             need = least - len(self.captures)
             return CaptureVerdict(
-                symbol=self.task.symbol, said=(f"{need} more capture{'s' * (need > 1)} for a first estimate.",)
+                symbol=self.task.symbol,
+                said=(f"{need} more capture{'s' * (need > 1)} for a first estimate.",),
+                advice=self.task.first_pose(self.captures[-1].pose if self.captures else None),
             )
         try:
             return self.task.solve(self.folder, self.captures[-1].pose)
@@ -289,6 +307,13 @@ def jog(now: ArmPose, goal: RigidTransform) -> str:
     said += [f"turn the flange about its own centre by {', then '.join(turned)}"] if turned else []
     words = "; then ".join(said) or "stay"
     return f"{words[0].upper()}{words[1:]}."
+
+
+def jog_joints(now: Array, goal: Array) -> str:
+    """Return in words how to jog the joints (n,) rad from where they are to a goal."""
+    turns = np.degrees(goal - now)
+    words = ", ".join(f"J{k + 1} by {t:+.0f} deg" for k, t in enumerate(turns) if abs(t) > 1.0)
+    return f"Turn the joints: {words}." if words else "Stay."
 
 
 def ur_pose(X_BF: RigidTransform) -> str:

@@ -34,6 +34,7 @@ from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import FlangeScan, fit_flanges, flange_scan
+from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import radius_95
@@ -58,6 +59,7 @@ _CLEARLY_M = 0.02  # a choice: of the arm, which a camera at 3 m would show by s
 _EDGE_SEEN = 0.6  # a choice: share of the flange's edge; less leaves its centre open across the missing part
 _SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures have 2 to 3, soft large ones 5
 _SMALL_PX = 8.0  # a choice: between neighbours of a board; a corner is found to a twentieth of it at best
+_DARK, _BRIGHT = 40, 230  # a choice: grey values; a board in them has no contrast left
 _TRIED = 200  # a choice: the best of so many poses lies in the best 1 % of all (chance 0.87)
 _WIDER, _ASIDE = 1.15, 0.1  # a choice: how far beyond the places so far the next one may lie; at least so far aside
 _TILT_RAD = np.radians(30.0)  # paper, section 2.1.4: the largest angle of the face to the line of sight
@@ -82,7 +84,7 @@ class FlangeTask:
         document |= {"units": {"clouds": "auto", "poses": "auto"}, "poses": {"file": POSES_FILE}}
         write_atomic(folder / "dataset.yaml", yaml_dump(document | ({"robot": self._robot} if self._robot else {})))
 
-    def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
         """See CaptureTask."""
         try:
             points = to_metres(read_cloud(path).astype(float), AUTO, path.name)
@@ -124,6 +126,9 @@ class FlangeTask:
         """See CaptureTask."""
         return FlangeTask(self._robot, self._standard.designation)
 
+    def first_pose(self, last: ArmPose | None) -> Advice | None:
+        """See CaptureTask."""
+
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """See CaptureTask."""
         try:
@@ -150,7 +155,16 @@ class FlangeTask:
         if read is not None and last.X_BF is None:
             last = ArmPose(X_BF=list(read.poses.values())[-1])
         advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last, self._shunned)
-        return CaptureVerdict(symbol=self.symbol, said=said, X=estimate.X_BC, error_95_m=error, odd=odd, advice=advice)
+        off = position_errors(estimate.X_BC, found.observations)
+        return CaptureVerdict(
+            symbol=self.symbol,
+            said=said,
+            X=estimate.X_BC,
+            error_95_m=error,
+            odd=odd,
+            advice=advice,
+            placed=tuple((o.id, estimate.X_BC, float(e)) for o, e in zip(found.observations, off, strict=True)),
+        )
 
     def command(self, folder: Path) -> str:
         """See CaptureTask."""
@@ -178,6 +192,7 @@ class BoardTask:
         self._robot, self._intrinsics, self._known = robot or None, intrinsics, dict[str, Picture]()
         if intrinsics is not None:
             read_camera(intrinsics)  # it can be read
+        self._looked = dict[str, Picture]()
         self._used: RecordedHandEye | None = None
         self.symbol = "X_BC" if mounting == "eye_on_base" else "X_FC"
 
@@ -186,22 +201,29 @@ class BoardTask:
         if self._intrinsics is not None:
             shutil.copyfile(self._intrinsics, folder / self._intrinsics.name)
 
-    def look(self, id: str, path: Path) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
         """See CaptureTask."""
         grey = load_grey(path)
         if grey is None:
             return None, f"'{path.name}' cannot be read as a picture."
+        size = next((p.size for p in self._looked.values()), grey.shape[::-1])
+        if size != grey.shape[::-1]:
+            return None, (
+                f"The picture has {grey.shape[1]} x {grey.shape[0]} pixels, those before {size[0]} x {size[1]}: set the"
+                " camera as it was, or begin another folder."
+            )
         if self._board.layouts > 1:
             self._board = with_layout([grey], self._board)
         points = find_board(grey, self._board)
         seen = np.isfinite(points[:, 0])
         if int(seen.sum()) < (4 if self._board.kind == "tag" else min(8, len(points))):
-            there = what_is_there([grey], self._board)
+            there = what_is_there([grey], self._board) or _light(grey)
             return None, (
                 f"The board {self._text} is not in the picture{f': {there}' if there else ''}. Show it whole, sharp and"
                 " evenly lit, with its white margin."
             )
         picture = Picture(name=path.name, points=points, size=grey.shape[::-1], thumbnail=b"")
+        self._looked[id] = picture
         gap = _gap(points)
         if gap < _SMALL_PX:
             return picture, f"The board's points are {gap:.0f} px apart: bring the board nearer."
@@ -228,12 +250,16 @@ class BoardTask:
 
     def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
+        self._looked.pop(id, None)
         for name in [name for name in self._known if Path(name).stem == id]:
             del self._known[name]
 
     def fresh(self) -> CaptureTask:
         """See CaptureTask."""
         return BoardTask(self._text, self._mounting, self._robot or "", self._intrinsics)
+
+    def first_pose(self, last: ArmPose | None) -> Advice | None:
+        """See CaptureTask."""
 
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """See CaptureTask."""
@@ -333,6 +359,14 @@ def _facing(p: Array, rng: np.random.Generator) -> RotationMatrix:
     normal = exp_rotation(rng.uniform(0.0, _TILT_RAD) * side / np.linalg.norm(side)) @ sight
     X = RotationMatrix.MakeFromOneVector(normal, 2)
     return X @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
+
+
+def _light(grey: NDArray[np.uint8]) -> str:
+    """Say what is wrong with the light of a picture; "" where nothing is."""
+    low, high = np.percentile(grey, [2.0, 98.0])
+    if high < _DARK:
+        return "it is dark; expose for longer"
+    return "it is overexposed; expose for a shorter time" if low > _BRIGHT else ""
 
 
 def _gap(points: Array) -> float:

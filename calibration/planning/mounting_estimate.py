@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of, expected_factors
 from weldcal.calibration.flange.base_circle import fit_base_circle
-from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import as_transform, skew
 from weldcal.calibration.hand_eye.determinacy import check_poses, determinacy, with_open_directions
@@ -56,13 +56,15 @@ class Circle:
 class ObservedCircle:
     """One scan with the circle.
 
-    The arms' joints and expected view, the observation, and the visible share of the circle's edge.
+    The arms' joints and expected view, the observation, the visible share of the circle's edge, and the circle as
+    found.
     """
 
     label: str
     pose: MountingPose
     observation: TargetObservation
     coverage: float
+    fit: FlangeFit | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +133,7 @@ def see_circle(
     )
     own = block_diag(fit.normal_sigma**2 * np.eye(3), R.T @ fit.center_covariance @ R)  # for an arc it is not isotropic
     observation = belief.observation(q, q_2, fit.center_C, fit.normal_C, _FIT_SHARE**2 * own)
-    return ObservedCircle(label, MountingPose(q, q_2, X_CR), observation, fit.coverage)
+    return ObservedCircle(label, MountingPose(q, q_2, X_CR), observation, fit.coverage, fit)
 
 
 def off_prediction(

@@ -64,11 +64,11 @@ def test_captures_that_follow_the_advice_give_the_scanner_inside_its_region(tmp_
         for k in range(8):
             assert not take(one, cell, tmp_path).refused
             verdict = one.verdict()
-            cell.jog("next" if verdict.advice is not None else MOVES[k], verdict.advice and verdict.advice.X_BF)
+            cell.jog("next" if verdict.advice is not None else MOVES[k], verdict.advice)
         assert verdict.X is not None
         assert verdict.error_95_m is not None
         work = np.mean([c.pose.X_BF.translation() for c in one.captures if c.pose.X_BF is not None], axis=0)
-        error = np.linalg.norm(verdict.X @ cell.X_BC.inverse() @ work - work)
+        error = np.linalg.norm(verdict.X @ cell.X_LC.inverse() @ work - work)
         inside += bool(error < verdict.error_95_m)
     assert inside >= 6
     assert (calibrate_flange(one.folder).result.X_BC.GetAsMatrix4() == verdict.X.GetAsMatrix4()).all()
@@ -178,7 +178,7 @@ def test_typed_poses_in_millimetres_and_degrees_are_read_by_what_the_scans_show(
         cell.jog(move, None)
     verdict = one.verdict()
     assert verdict.X is not None, verdict.said
-    assert np.linalg.norm(verdict.X.translation() - cell.X_BC.translation()) < 5e-4
+    assert np.linalg.norm(verdict.X.translation() - cell.X_LC.translation()) < 5e-4
 
 
 def test_the_result_in_use_is_judged_by_new_captures(tmp_path: Path, cell: DemoCell) -> None:
@@ -193,7 +193,7 @@ def test_the_result_in_use_is_judged_by_new_captures(tmp_path: Path, cell: DemoC
     assert error < 1e-4
     assert (tmp_path / "s" / "calibration" / "calibration.yaml").is_file()
     cell.jog("+y", None)
-    cell.X_BC = RigidTransform([0.003, 0.0, 0.0]) @ cell.X_BC
+    cell.X_LC = RigidTransform([0.003, 0.0, 0.0]) @ cell.X_LC
     assert one.check(cell.take(tmp_path), cell.pose())[1] == pytest.approx(3e-3, abs=2e-4)
     assert len(one.captures) == len(MOVES), "what judges is not what calibrates"
 
@@ -212,7 +212,7 @@ def test_a_pose_whose_scan_was_refused_is_not_proposed_again(
     first = begun.verdict().advice
     assert first is not None
     assert first.X_BF is not None
-    cell.jog("next", first.X_BF)
+    cell.jog("next", first)
     assert begun.take(wrong_scan(cell, tmp_path, "nothing there"), cell.pose()).refused
     second = begun.verdict().advice
     assert second is not None
@@ -347,7 +347,7 @@ def test_a_picture_is_judged_at_once(tmp_path: Path, picture: np.ndarray, said: 
     cv2.imwrite(str(tmp_path / "p.png"), picture)
     task = BoardTask(BOARD, "eye_in_hand")
     began = time.monotonic()
-    found, refused = task.look("001", tmp_path / "p.png")
+    found, refused = task.look("001", tmp_path / "p.png", ArmPose())
     assert time.monotonic() - began < 3.0
     assert bool(refused) == bool(said), refused
     assert re.search(said, refused)

@@ -9,8 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from weldcal.calibration.capture.carried import CarriedTask
 from weldcal.calibration.capture.session import CaptureSession, CaptureTask
 from weldcal.calibration.capture.tasks import BoardTask, FlangeTask
+from weldcal.calibration.data.results import ON_BASE
+from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.arm_poses import KINDS, ArmSource, arm_source
@@ -64,20 +67,19 @@ def capture(
     """
     if mounting not in ("eye_in_hand", "eye_on_base"):
         raise InputError(f"--mounting must be eye_in_hand (on the flange) or eye_on_base, not '{mounting}'.")
-    if demo and (scenario or watch or webcam or poses or board):
+    if demo and (watch or webcam or poses or board):
         raise InputError("--demo brings its own arm and scanner: leave out the sensor, --poses and --board.")
-    cell = DemoCell(call.seed) if demo else None
+    carried = None if scenario is None else _carried(scenario, call.seed)
+    cell = DemoCell(call.seed, None if carried is None else carried.scene) if demo else None
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
-    task: CaptureTask = (
-        BoardTask(board, mounting, robot, call.reading.get("intrinsics"))
-        if board
-        else FlangeTask(robot, flange or _flange_of(robot))
-    )
+    task: CaptureTask | None = carried
+    if board or task is None:
+        task = _task(board, mounting, robot, flange, call.reading.get("intrinsics"))
     run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
     with claimed(out, overwrite=True), closing(run):
-        _serve(run, call.live["browser"])
+        _serve(run, call.live["browser"], robot if carried is None else carried.scene.arm.name)
     return {
         "state": "done",
         "folder": str(out),
@@ -86,12 +88,12 @@ def capture(
     }
 
 
-def _serve(run: CaptureRun, browser: bool) -> None:
+def _serve(run: CaptureRun, browser: bool, robot: str) -> None:
     """Serve the page until Ctrl+C."""
     from weldcal.tools.dashboard.capture_view import CaptureView
     from weldcal.tools.dashboard.server import Dashboard  # Flask takes a moment to load
 
-    view = CaptureView()
+    view = CaptureView(load_arm(robot) if robot in known_arms() else None)
     with closing(Dashboard(run, view.url, page="capture")) as page:
         console.emit_address("capture", page.url)
         if browser:
@@ -105,6 +107,25 @@ def _serve(run: CaptureRun, browser: bool) -> None:
             return
 
 
+def _task(board: str | None, mounting: str, robot: str, flange: str, intrinsics: Path | None) -> CaptureTask:
+    """Return the task of a camera, or of a scanner beside the arm."""
+    if board:
+        return BoardTask(board, mounting, robot, intrinsics)
+    return FlangeTask(robot, flange or _flange_of(robot))
+
+
+def _carried(scenario: str, seed: int) -> CarriedTask | None:
+    """Return the task of a scenario whose scanner is carried by the arm; None where it stands beside it."""
+    from weldcal.systems.jobs.mounting.job import mounting_plan, mounting_scene
+    from weldcal.systems.scenario.loading import load_scenario
+
+    loaded = load_scenario(scenario)
+    if loaded.calibration.configuration == ON_BASE:
+        return None
+    header, scene, circle = mounting_scene(loaded, load_arm(loaded.arm))
+    return CarriedTask(header, scene, circle, mounting_plan(loaded, seed))
+
+
 def _flange_of(robot: str) -> str:
     if not robot:
         raise InputError("Name the arm with --robot, such as ur10e, or its flange with --flange.")
@@ -113,7 +134,7 @@ def _flange_of(robot: str) -> str:
 
 def _sensor(scenario: str | None, watch: Path | None, webcam: str | None) -> Sensor:
     """Return what takes the scans or pictures. Raises InputError where none, or several, are named."""
-    if sum(one is not None for one in (scenario, watch, webcam)) != 1:
+    if sum(one is not None for one in (scenario if watch is None else None, watch, webcam)) != 1:
         raise InputError(
             "Name one sensor: --watch FOLDER, into which its own program writes; --webcam N; a scenario with its"
             " driver; or --demo."

@@ -13,9 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from pydrake.math import RigidTransform
 
-from weldcal.calibration.capture.session import RESULT, ArmPose, Capture, CaptureSession, CaptureVerdict, ur_pose
+from weldcal.calibration.capture.session import RESULT, Advice, ArmPose, Capture, CaptureSession, CaptureVerdict
 from weldcal.calibration.data.clouds import SUFFIXES, CloudError, read_cloud, save_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
@@ -51,11 +50,14 @@ class Sensor(Protocol):
 class JoggedArm(Protocol):
     """An emulated arm that the page's buttons jog."""
 
+    jogs: tuple[str, ...]
+
     def shape(self) -> list[TriMesh]:
         """The arm in the base, as the 3D view shows it."""
 
-    def jog(self, name: str, goal: RigidTransform | None) -> None:
-        """Move a step along or about an axis of the base ("+x", "-rz"), or to a goal ("next"). Raises WeldcalError."""
+    def jog(self, name: str, advice: Advice | None) -> None:
+        """Move a step along or about an axis of the base ("+x", "-rz"), turn a joint ("+J4"), go "home", or "next" as
+        advised. Raises WeldcalError."""
 
 
 class SensorError(WeldcalError):
@@ -213,7 +215,7 @@ class CaptureRun:
             "sensor": self.sensor.words,
             "waits": isinstance(self.sensor, FolderSensor),
             "typed": isinstance(self.arm, TypedPose),
-            "jogs": isinstance(self.arm, JoggedArm),
+            "jogs": list(self.arm.jogs) if isinstance(self.arm, JoggedArm) else [],
             "by_itself": self.by_itself,
             "problem": self.problem,
             "last": None if last is None else {"id": last.id, "refused": last.refused},
@@ -226,7 +228,7 @@ class CaptureRun:
             "said": list(v.said),
             "advice": None if v.advice is None else v.advice.words,
             "gain": None if v.advice is None else v.advice.gain,
-            "ur_pose": None if v.advice is None or v.advice.X_BF is None else ur_pose(v.advice.X_BF),
+            "ur_pose": None if v.advice is None else v.advice.ur,
             "checks": self.checks,
             "result": str((self.session.folder.parent / RESULT).absolute()),
             "used": self.used,
@@ -264,8 +266,7 @@ class CaptureRun:
 
     def _do(self, wish: str) -> None:
         if wish.startswith("jog-") and isinstance(self.arm, JoggedArm):
-            goal = None if self.verdict.advice is None else self.verdict.advice.X_BF
-            self.arm.jog(wish.removeprefix("jog-"), goal)
+            self.arm.jog(wish.removeprefix("jog-"), self.verdict.advice)
             return
         if wish in ("capture", "file"):
             self.state = TAKING

@@ -246,10 +246,16 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[DatasetHeader, Mo
 
 def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[MountingPose, ...]:
     """Plan the calibration poses, the held-out poses and spare ones, before any motion. Raises UnreachableScanner."""
+    c = scenario.calibration
+    return plan_mounting_poses(scene, c.maximum_scans, c.verification_scans, mounting_plan(scenario, seed))
+
+
+def mounting_plan(scenario: Scenario, seed: int) -> MountingPlan:
+    """Return the limits of the poses that the scenario states."""
     c, job = scenario.calibration, scenario.part(MountingJob)
     assert job is not None
     visited = c.maximum_scans + c.verification_scans
-    plan = MountingPlan(
+    return MountingPlan(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
         spread_rad=np.deg2rad(job.spread_deg),
@@ -258,7 +264,6 @@ def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[
         margin_m=c.clearance_m,
         candidates=visited + SPARE,
     )
-    return plan_mounting_poses(scene, c.maximum_scans, c.verification_scans, plan)
 
 
 def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransform]:

@@ -64,7 +64,7 @@ def test_a_person_reaches_a_calibration_by_the_page_alone(run: CaptureRun, brows
         browser.screenshot(tmp_path / "page.png")
     assert run.verdict.X is not None
     assert run.verdict.error_95_m is not None
-    off = np.linalg.norm(run.verdict.X.translation() - cell.X_BC.translation())
+    off = np.linalg.norm(run.verdict.X.translation() - cell.X_LC.translation())
     assert off < 2e-4
     again = calibrate_flange(tmp_path / "s")
     assert (again.result.X_BC.GetAsMatrix4() == run.verdict.X.GetAsMatrix4()).all()

@@ -53,8 +53,8 @@ function shown(v) {
   list("checks", v.checks.map(c => [c.error_mm.toFixed(3) + " mm", c.error_mm > v.required_mm]));
   say("folder", v.folder);
   say("command", v.command);
-  if (v.jogs && !el("jogs").children.length) {
-    for (const name of ["+x", "-x", "+y", "-y", "+z", "-z", "+rx", "-rx", "+ry", "-ry", "+rz", "-rz", "home"]) {
+  if (v.jogs.length && !el("jogs").children.length) {
+    for (const name of v.jogs) {
       const b = document.createElement("button");
       b.type = "button"; b.textContent = name.includes("r") ? "turn " + name.replace("r", "") : name; b.addEventListener("click", () => ask("jog-" + name));
       el("jogs").append(b);
@@ -63,7 +63,7 @@ function shown(v) {
     go.type = "button"; go.id = "go"; el("jogs").title = "steps of 50 mm and 15 deg"; go.textContent = "to the next pose"; go.style.gridColumn = "1 / -1"; go.addEventListener("click", () => ask("jog-next"));
     el("jogs").append(go);
   }
-  show("jogs", v.jogs);
+  show("jogs", v.jogs.length > 0);
   last = v;
 }
 
