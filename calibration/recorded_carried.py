@@ -49,7 +49,8 @@ _HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # joints that a datas
 _FOLDS = 5  # a choice: with the ten scans of a usual calibration each fold leaves two out
 _WIDER_M = 0.25  # radius of the search about a guess that may be wrong
 _TRIED_AGAIN = 3  # scans
-_SAME = 1e-4  # m, and as a matrix: what a controller rounds
+SAME = 1e-4  # m, and as a matrix: what a controller rounds
+"""Difference of a stated pose from that of its joint angles that is one of digits."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -284,7 +285,7 @@ def recorded_joints(data: Dataset, scene: MountingScene) -> dict[str, Joints]:
     for id, X_BF in data.poses.items():
         q = given.get(id)
         reached = None if q is None else scene.frames(q)[FLANGE]
-        if q is None or reached is None or not reached.IsNearlyEqualTo(X_BF, _SAME):
+        if q is None or reached is None or not reached.IsNearlyEqualTo(X_BF, SAME):
             if on_arm:
                 raise InputError(
                     f"The joint angles of '{id}' do not lead the {scene.arm.name} to its stated pose. Check the robot's"

@@ -32,7 +32,7 @@ from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.planning.mounting_estimate import Circle, ObservedCircle, fewest, off_prediction, see_circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
-from weldcal.calibration.recorded_carried import CarriedCalibration, Joints, calibrate_carried
+from weldcal.calibration.recorded_carried import SAME, CarriedCalibration, Joints, calibrate_carried
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -87,6 +87,10 @@ class CarriedTask:
         self._seen[id] = one
         return one.fit, ""
 
+    def repeats(self, one: Capture, other: Capture) -> str:
+        """See CaptureTask: a turn about the circle's axis shows it as before."""
+        return ""
+
     def contradicts(self, one: Capture, other: Capture) -> str:
         """See CaptureTask."""
         a, b = self._seen.get(one.id), self._seen.get(other.id)
@@ -97,7 +101,7 @@ class CarriedTask:
             return ""
         return (
             f"This scan and {one.id} put the circle {1e3 * apart:.0f} mm apart, by the poses of the arm: the pose or the"
-            " scan is an older one, or something was moved."
+            " scan is an older one, a TCP is set at the robot, or something was moved."
         )
 
     def forget(self, id: str, shunned: ArmPose | None = None) -> None:
@@ -214,15 +218,21 @@ class CarriedTask:
         return np.asarray(X_CR.inverse() @ one.observation.p_CM)
 
     def _joints(self, pose: ArmPose) -> Joints:
-        """Return the joints of the arm at a pose. Raises InputError where they are not known."""
-        if pose.q is not None:
-            return pose.q, None
-        on_link = self.scene.link != FLANGE
-        q = None if pose.X_BF is None or on_link else nearest_solution(self.scene.arm, pose.X_BF, self.scene.q_home)
+        """Return the joints of the arm at a pose, as `calibrate` takes them. Raises InputError where they are unknown."""
+        arm, q, on_link = self.scene.arm, pose.q, self.scene.link != FLANGE
+        if q is not None and pose.X_BF is not None:
+            q = q if self.scene.frames(q)[FLANGE].IsNearlyEqualTo(pose.X_BF, SAME) else None
+            if q is None and on_link:
+                raise InputError(
+                    f"The joint angles do not lead the {arm.name} to the stated pose: a TCP is set at the robot, or the"
+                    " robot is another one."
+                )
+        if q is None and pose.X_BF is not None and not on_link:
+            q = nearest_solution(arm, pose.X_BF, self.scene.q_home if pose.q is None else pose.q)
         if q is None:
             raise InputError(
                 "A scanner that the arm carries needs the arm's joint angles: read them with --poses."
                 if on_link
-                else f"The {self.scene.arm.name} does not reach this pose, or it is typed: read poses with --poses."
+                else f"The {arm.name} does not reach this pose, or it is typed: read poses with --poses."
             )
         return q, None

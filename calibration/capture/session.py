@@ -146,6 +146,9 @@ class CaptureTask(Protocol):
     def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
         """Return what a file shows, taken at a pose, and why it cannot be used ("": it can)."""
 
+    def repeats(self, one: Capture, other: Capture) -> str:
+        """Say that both show the same though the arm has moved; "" where they do not."""
+
     def contradicts(self, one: Capture, other: Capture) -> str:
         """Say how the move from one capture to the other contradicts that of the arm; "" where it does not."""
 
@@ -219,6 +222,8 @@ class CaptureSession:
         shutil.copyfile(source, hidden)
         found, why = self.task.look(id, hidden, pose)
         one = replace(one, found=found)
+        if not why:
+            why = next((said for other in self.captures if (said := self.task.repeats(other, one))), "")
         if not why:
             against = [said for other in self.captures if (said := self.task.contradicts(other, one))]
             why = against[-1] if 2 * len(against) > len(self.captures) else ""

@@ -5,7 +5,7 @@ The scans are cast at the drawn arm; the scanner's true pose on it is not known 
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
 from pathlib import Path
 
 import numpy as np
@@ -75,11 +75,11 @@ def test_wrong_acts_are_named(tmp_path: Path) -> None:
     old = cell.pose()
     cell.jog("next", one.verdict().advice)
     scan = cell.take(tmp_path)
-    assert "an older one" in one.take(scan, replace(old, q=old.q + 0.1)).refused
+    assert "an older one" in one.take(scan, ArmPose(X_BF=task.scene.frames(old.q + 0.1)[6], q=old.q + 0.1)).refused
     X = cell.pose().X_BF
     assert X is not None
-    refused = one.take(scan, ArmPose(X_BF=X @ RigidTransform([0.0, 0.08, 0.0]))).refused
-    assert "a TCP is set" in refused or "an older one" in refused
+    refused = one.take(scan, ArmPose(X_BF=X @ RigidTransform([0.0, 0.08, 0.0]), q=cell.pose().q)).refused
+    assert re.search("a TCP is set|not the flange", refused)
     with pytest.raises(InputError, match="read poses with --poses"):
         one.take(scan, ArmPose(numbers=(400.0, 0.0, 300.0, 180.0, 0.0, 90.0)))
     assert len(one.captures) == 3
@@ -89,8 +89,12 @@ def test_an_arm_link_needs_joint_angles(tmp_path: Path) -> None:
     task = carried("eye_on_arm")
     cell = DemoCell(1, task.scene)
     one = CaptureSession(tmp_path / "captures", task)
+    X, q = cell.pose().X_BF, cell.pose().q
+    assert X is not None
     with pytest.raises(InputError, match="needs the arm's joint angles"):
-        one.take(cell.take(tmp_path), ArmPose(X_BF=cell.pose().X_BF))
+        one.take(cell.take(tmp_path), ArmPose(X_BF=X))
+    with pytest.raises(InputError, match="a TCP is set at the robot"):
+        one.take(cell.take(tmp_path), ArmPose(X_BF=X @ RigidTransform([0.0, 0.0, 0.1]), q=q))
 
 
 def test_two_arms_are_refused_with_the_command_that_does_it() -> None:
