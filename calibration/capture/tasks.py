@@ -56,7 +56,6 @@ from weldcal.models.robots import stated_flange
 _APART_M, _APART = 0.01, 0.05  # a choice: centres in two frames differ by less, also with a wrong scale or a small TCP
 _SHUN_M, _SHUN_RAD = 0.05, np.radians(15.0)  # a choice: about a pose whose scan was of no use
 _CLEARLY_M = 0.02  # a choice: of the arm, which a camera at 3 m would show by several pixels
-_SAME_M = 1e-3  # a choice: ten times what the centre of one flange in two scans differs by
 _EDGE_SEEN = 0.6  # a choice: share of the flange's edge; less leaves its centre open across the missing part
 _SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures have 2 to 3, soft large ones 5
 _SMALL_PX = 8.0  # a choice: between neighbours of a board; a corner is found to a twentieth of it at best
@@ -103,16 +102,8 @@ class FlangeTask:
         return fit, ""
 
     def repeats(self, one: Capture, other: Capture) -> str:
-        """See CaptureTask."""
-        if not isinstance(one.found, FlangeFit) or not isinstance(other.found, FlangeFit):
-            return ""
-        shown, away = float(np.linalg.norm(one.found.center_C - other.found.center_C)), one.pose.moved(other.pose)[0]
-        if shown > _SAME_M or away < _CLEARLY_M or not np.isfinite(away):
-            return ""
-        return (
-            f"The flange is where it was in {one.id}, to {1e3 * shown:.1f} mm, and the arm moved by {1e3 * away:.0f} mm:"
-            " the scan is an older one."
-        )
+        """See CaptureTask: an older scan contradicts the arm's moves."""
+        return ""
 
     def contradicts(self, one: Capture, other: Capture) -> str:
         """See CaptureTask."""

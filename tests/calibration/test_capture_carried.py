@@ -81,7 +81,7 @@ def test_wrong_acts_are_named(tmp_path: Path) -> None:
     refused = one.take(scan, ArmPose(X_BF=X @ RigidTransform([0.0, 0.08, 0.0]), q=cell.pose().q)).refused
     assert re.search("a TCP is set|not the flange", refused)
     with pytest.raises(InputError, match="read poses with --poses"):
-        one.take(scan, ArmPose(numbers=(400.0, 0.0, 300.0, 180.0, 0.0, 90.0)))
+        CaptureSession(tmp_path / "other", task).take(scan, ArmPose(numbers=(400.0, 0.0, 300.0, 180.0, 0.0, 90.0)))
     assert len(one.captures) == 3
 
 
