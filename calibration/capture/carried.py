@@ -19,6 +19,7 @@ from weldcal.calibration.capture.session import (
     Capture,
     CaptureTask,
     CaptureVerdict,
+    Shown,
     jog,
     jog_joints,
 )
@@ -26,9 +27,7 @@ from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses, UnreachableScanner
-from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
-from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.planning.mounting_estimate import Circle, ObservedCircle, fewest, off_prediction, see_circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
@@ -64,7 +63,7 @@ class CarriedTask:
         lines = {k: v for k, v in asdict(header).items() if v not in (None, "", 0.0)}
         write_atomic(folder / "dataset.yaml", yaml_dump(lines))
 
-    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[Shown | None, str]:
         """See CaptureTask."""
         joints = self._joints(pose)
         try:

@@ -6,7 +6,7 @@ import csv
 import io
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -23,7 +23,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.files import write_atomic
 
 POSES_FILE = "robot.csv"
-FOLDERS = ("clouds", "pictures")
+FOLDERS = ("clouds", "pictures", "profiles")
 """Of the kinds of captures, one in a session."""
 TYPED = 5
 """Captures with typed poses from which on they show together how the numbers are to be read."""
@@ -79,13 +79,25 @@ class ArmPose:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ShownProfile:
+    """A profile [x, z] (n, 2) m, and the points (k, 2) m of the target in it."""
+
+    points: Array
+    feature: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+Shown = FlangeFit | Picture | ShownProfile
+"""What a file shows."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
     """One scan or picture with its pose, what was found in it, and why it is left out ("": it counts)."""
 
     id: str
     file: Path
     pose: ArmPose
-    found: FlangeFit | Picture | None = None
+    found: Shown | None = None
     refused: str = ""
 
 
@@ -143,7 +155,7 @@ class CaptureTask(Protocol):
     def prepare(self, folder: Path) -> None:
         """Write what the folder needs besides captures."""
 
-    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[Shown | None, str]:
         """Return what a file shows, taken at a pose, and why it cannot be used ("": it can)."""
 
     def repeats(self, one: Capture, other: Capture) -> str:

@@ -24,6 +24,7 @@ from weldcal.calibration.capture.session import (
     Capture,
     CaptureTask,
     CaptureVerdict,
+    Shown,
     jog,
 )
 from weldcal.calibration.data.camera_file import read_camera
@@ -84,7 +85,7 @@ class FlangeTask:
         document |= {"units": {"clouds": "auto", "poses": "auto"}, "poses": {"file": POSES_FILE}}
         write_atomic(folder / "dataset.yaml", yaml_dump(document | ({"robot": self._robot} if self._robot else {})))
 
-    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[Shown | None, str]:
         """See CaptureTask."""
         try:
             points = to_metres(read_cloud(path).astype(float), AUTO, path.name)
@@ -205,7 +206,7 @@ class BoardTask:
         if self._intrinsics is not None:
             shutil.copyfile(self._intrinsics, folder / self._intrinsics.name)
 
-    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[FlangeFit | Picture | None, str]:
+    def look(self, id: str, path: Path, pose: ArmPose) -> tuple[Shown | None, str]:
         """See CaptureTask."""
         grey = load_grey(path)
         if grey is None:

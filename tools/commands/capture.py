@@ -20,6 +20,7 @@ from weldcal.systems.drivers.arm_poses import KINDS, ArmSource, arm_source
 from weldcal.tools import console
 from weldcal.tools.cli.options import LOOK, Call, command, option, switch
 from weldcal.tools.cli.result_folder import claimed
+from weldcal.tools.commands.profiler.captured import ProfileTask
 from weldcal.tools.dashboard.capture_demo import ROBOT, DemoCell
 from weldcal.tools.dashboard.capture_run import CaptureRun, DriverSensor, FolderSensor, Sensor
 from weldcal.tools.dashboard.capture_run import webcam as opened_webcam
@@ -50,6 +51,14 @@ def capture(
     mounting: Annotated[
         str, option("--mounting", "NAME", "Of the camera: eye_in_hand (on the flange) or eye_on_base.")
     ] = "eye_in_hand",
+    profiler: Annotated[
+        str,
+        option(
+            "--profiler",
+            "TARGET",
+            "Of a laser profiler on the flange: edge:bar, edge:step, edge:apex, sphere:RADIUS_MM.",
+        ),
+    ] = "",
     robot: Annotated[str, option("--robot", "NAME", "The arm, such as ur10e.")] = "",
     flange: Annotated[str, option("--flange", "NAME", "The flange, where the arm's own does not say.")] = "",
     required_mm: Annotated[
@@ -74,9 +83,13 @@ def capture(
     sensor = cell or _sensor(scenario, watch, webcam)
     arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
-    task: CaptureTask | None = carried
-    if board or task is None:
-        task = _task(board, mounting, robot, flange, call.reading.get("intrinsics"))
+    task: CaptureTask
+    if board:
+        task = BoardTask(board, mounting, robot, call.reading.get("intrinsics"))
+    elif profiler:
+        task = ProfileTask(profiler, robot)
+    else:
+        task = carried or FlangeTask(robot, flange or _flange_of(robot))
     run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
     with claimed(out, overwrite=True), closing(run):
         _serve(run, call.live["browser"], robot if carried is None else carried.scene.arm.name)
@@ -105,13 +118,6 @@ def _serve(run: CaptureRun, browser: bool, robot: str) -> None:
                     view.show(run)
         except KeyboardInterrupt:
             return
-
-
-def _task(board: str | None, mounting: str, robot: str, flange: str, intrinsics: Path | None) -> CaptureTask:
-    """Return the task of a camera, or of a scanner beside the arm."""
-    if board:
-        return BoardTask(board, mounting, robot, intrinsics)
-    return FlangeTask(robot, flange or _flange_of(robot))
 
 
 def _carried(scenario: str, seed: int) -> CarriedTask | None:

@@ -13,11 +13,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from weldcal.calibration.capture.session import RESULT, Advice, ArmPose, Capture, CaptureSession, CaptureVerdict
+from weldcal.calibration.capture.session import (
+    RESULT,
+    Advice,
+    ArmPose,
+    Capture,
+    CaptureSession,
+    CaptureVerdict,
+    ShownProfile,
+)
 from weldcal.calibration.data.clouds import SUFFIXES, CloudError, read_cloud, save_cloud
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.pictures.search import Picture, load_grey
+from weldcal.calibration.profiler.exports import TABLES
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.systems.drivers.arm_poses import ArmSource, TypedPose
@@ -103,7 +113,7 @@ class FolderSensor:
         if not folder.is_dir():
             raise InputError(f"There is no folder '{folder}': name the one into which the sensor's program writes.")
         self.words = f"files in '{folder.name}'"
-        self._files = NewFiles(folder, (*SUFFIXES, *PICTURES), SETTLE_S)
+        self._files = NewFiles(folder, (*dict.fromkeys((*SUFFIXES, *PICTURES, *TABLES)),), SETTLE_S)
         self._files.start()
         self._new: list[Path] = []
 
@@ -302,6 +312,8 @@ class CaptureRun:
 
 def drawn(file: Path, one: Capture) -> bytes | None:
     """Return a scan's depths or a picture as PNG, with what was found in it drawn in."""
+    if isinstance(one.found, ShownProfile):
+        return png(profile_picture(one.found))
     if isinstance(one.found, Picture) or load_grey(file) is not None:
         grey = load_grey(file)
         if grey is None:
@@ -319,3 +331,14 @@ def drawn(file: Path, one: Capture) -> bytes | None:
     except CloudError:
         return None
     return png(depth_picture(points, one.found if isinstance(one.found, FlangeFit) else None))
+
+
+def profile_picture(shown: ShownProfile) -> NDArray[np.uint8]:
+    """Return a profile as a picture (h, WIDTH_PX, 3) BGR, z downwards, the target's points in colour."""
+    p = shown.points[np.isfinite(shown.points).all(axis=1)]
+    low, size = p.min(axis=0), max(float(np.ptp(p, axis=0).max()), 1e-6)
+    picture = np.full((WIDTH_PX // 2 + 20, WIDTH_PX, 3), 40, np.uint8)
+    for points, colour in ((p, (200, 200, 200)), (shown.feature, _MARK)):
+        for x, z in 10.0 + (points - low) * (WIDTH_PX - 20) / size:
+            cv2.circle(picture, (round(x), round(z)), 1 if colour != _MARK else 3, colour, -1, cv2.LINE_AA)
+    return picture

@@ -175,7 +175,7 @@ def edge_shown(
 
 def _tried(blank: EdgeShown, sigmas: Sigmas, feature: str, side: str, grows: str) -> tuple[EdgeShown, SignFit]:
     """Return what the profiles show with one sign of z, and how far one edge explains it."""
-    at, lost = with_sign(blank.file.profiles or (), partial(_point, feature, side), grows)
+    at, lost = with_sign(blank.file.profiles or (), partial(point_of_edge, feature, side), grows)
     points = blank.points.copy()
     points[np.setdiff1d(np.arange(len(points)), lost)] = np.array(at).reshape(-1, 2)
     one = replace(blank, points=points, lost=lost)
@@ -191,7 +191,8 @@ def _tried(blank: EdgeShown, sigmas: Sigmas, feature: str, side: str, grows: str
     return replace(one, fit=(e, s)), SignFit(shown=len(at), kept=kept, variance=variance, freedom=free)
 
 
-def _point(feature: str, side: str, profile: Floats) -> Floats:
+def point_of_edge(feature: str, side: str, profile: Floats) -> Floats:
+    """Return the edge's point (2,) [x, z] m of a profile. Raises FeatureNotFound."""
     return extract_edge(profile, cast(Kind, feature), "left" if side == "left" else "right")[0]
 
 
@@ -240,7 +241,10 @@ def calibrate_edge(
     found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
     found |= figures_of(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
-        state = EdgeState(e.rotation, e.translation, e.point, e.direction)
+        # the side of the near face changes with the direction of the laser line: as in the scans so far
+        across = (poses[e.inliers].rotation @ e.rotation)[:, :, 0].mean(axis=0)
+        along = e.direction if np.cross(e.direction, [0.0, 0.0, -1.0]) @ across > 0.0 else -e.direction
+        state = EdgeState(e.rotation, e.translation, e.point, along)
         z = points[e.inliers, 1]
         field = Field(
             max(0.005, float(np.abs(points[e.inliers, 0]).max())), float(z.min()) - 1e-9, float(z.max()) + 2e-3

@@ -117,12 +117,22 @@ def read_sphere(
     data, form = read_measurements(call, file, unit, poses), call.reading.get("robot-form", "")
     felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=form))
     radius_m = None if radius is None else 1e-3 * radius
+    return decided_sphere(data, felt, radius_m=radius_m, arm=arm, tip_m=tip_m, lost=lost, seed=call.seed)
+
+
+def decided_sphere(
+    data: Measurements,
+    felt: Measurements | None = None,
+    *,
+    radius_m: float | None,
+    arm: str = "",
+    tip_m: Floats | None = None,
+    lost: list[int] | None = None,
+    seed: int = 0,
+) -> tuple[Measurements, SphereData]:
+    """Return measurements and their sphere with the reading of the poses that the arcs select; see sphere_data."""
     lost = [] if lost is None and len(data.readings) > 1 else lost
-
-    def of(file: Measurements, felt: Measurements | None, lost: list[int] | None) -> SphereData:
-        return sphere_data(file, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
-
-    found = of(data, felt, lost)
+    found = sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=seed)
     if len(data.readings) > 1:
         kept = np.setdiff1d(np.arange(len(data.readings[0].X)), lost or [])
         fit = sphere_fit(found.profiles, found.radius_m)
@@ -166,7 +176,7 @@ def sphere_data(
     profiles, kept = [], []
     for k, p in enumerate(file.profiles):
         try:
-            profiles.append(_arc(p, radius, seed))
+            profiles.append(arc_of(p, radius, seed))
             kept.append(k)
         except ArcNotFound as e:
             if lost is None:
@@ -207,7 +217,7 @@ def parse_tip(text: str) -> Floats | None:
     return tip
 
 
-def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
+def arc_of(profile: Floats, radius_m: float, seed: int) -> Floats:
     """Return the sphere's points of a profile: all of them where they form one arc, else those detected."""
     p = profile[np.isfinite(profile).all(axis=1)]
     if len(p) >= 5:
