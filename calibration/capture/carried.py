@@ -46,6 +46,7 @@ class CarriedTask:
     """Scans of the flange or of the ring of the base by a scanner on the arm; the folder is that of calibrate."""
 
     folder = "clouds"
+    hint = "Let the scanner see the whole circle from another direction each time, 10 to 30 deg apart."
 
     def __init__(self, header: DatasetHeader, scene: MountingScene, circle: Circle, plan: MountingPlan) -> None:
         if scene.two:

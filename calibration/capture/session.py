@@ -151,6 +151,8 @@ class CaptureTask(Protocol):
     symbol: str
     folder: str
     least: int
+    hint: str
+    """How to vary the poses while there is no advice."""
 
     def prepare(self, folder: Path) -> None:
         """Write what the folder needs besides captures."""

@@ -72,6 +72,7 @@ class FlangeTask:
     """Scans of the flange by a scanner beside the robot; the folder is that of `weldcal calibrate`."""
 
     symbol, folder, least = "X_BC", "clouds", LEAST
+    hint = "Move the flange by 50 to 150 mm and tilt it by 10 to 20 deg, each time in another direction."
 
     def __init__(self, robot: str, flange: str) -> None:
         self._standard = stated_flange(flange, robot)
@@ -191,6 +192,7 @@ class BoardTask:
     """Pictures of a board by a camera on the flange or beside the robot; the folder is that of `weldcal hand-eye`."""
 
     folder, least = "pictures", FEWEST
+    hint = "Turn the flange by 20 to 40 deg about another axis each time, with the whole board in the picture."
 
     def __init__(self, board: str, mounting: str, robot: str = "", intrinsics: Path | None = None) -> None:
         self._board, self._text, self._mounting = parse_board(board), board, mounting

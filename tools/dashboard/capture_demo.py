@@ -51,7 +51,7 @@ class DemoCell:
             q = nearest_solution(self._arm, _GUESS @ START_CF, HOME)
             assert q is not None
         else:
-            self.words = f"emulated {self._arm.name} that carries an emulated scanner"
+            self.words = f"emulated {get_robot(self._arm.name).title} that carries an emulated scanner"
             self.X_LC = scene.X_LC @ RigidTransform(RollPitchYaw(_KNOWN * turn), _KNOWN * shift)
             self._scanner, self._link = get_scanner(scene.scanner.name, _COLUMNS), scene.link
             q = scene.q_home

@@ -237,6 +237,7 @@ class CaptureRun:
             "required_mm": self.required_mm,
             "said": list(v.said),
             "advice": None if v.advice is None else v.advice.words,
+            "hint": self.session.task.hint,
             "gain": None if v.advice is None else v.advice.gain,
             "ur_pose": None if v.advice is None else v.advice.ur,
             "checks": self.checks,

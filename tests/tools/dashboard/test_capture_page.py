@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 
 from tests.browser import Browser
+from tests.figures.hand_eye.sessions import cell_and_task
+from weldcal.calibration.capture.carried import CarriedTask
 from weldcal.calibration.capture.session import Advice, CaptureSession, CaptureVerdict
 from weldcal.calibration.capture.tasks import FlangeTask
 from weldcal.calibration.data.clouds import read_cloud
@@ -70,8 +73,9 @@ def test_a_person_reaches_a_calibration_by_the_page_alone(run: CaptureRun, brows
     assert (again.result.X_BC.GetAsMatrix4() == run.verdict.X.GetAsMatrix4()).all()
 
 
-def test_only_a_file_from_after_the_press_counts(tmp_path: Path) -> None:
-    """A scan that lay there before is of a pose that nobody knows."""
+@pytest.mark.parametrize("clock_s", [0.0, -3600.0, 3600.0])
+def test_only_a_file_from_after_the_press_counts(tmp_path: Path, clock_s: float) -> None:
+    """A scan that lay there before is of a pose that nobody knows. The clock of the sensor's computer may be off."""
     (tmp_path / "in").mkdir()
     sensor, cell = FolderSensor(tmp_path / "in"), DemoCell(1)
     old = cell.take(tmp_path).rename(tmp_path / "in" / "old.npz")
@@ -81,7 +85,9 @@ def test_only_a_file_from_after_the_press_counts(tmp_path: Path) -> None:
     waiting.start()
     time.sleep(0.6)
     assert not done
-    new = cell.take(tmp_path).rename(tmp_path / "in" / "new.npz")
+    scan = cell.take(tmp_path)
+    os.utime(scan, (time.time() + clock_s, time.time() + clock_s))
+    new = scan.rename(tmp_path / "in" / "new.npz")
     waiting.join(5.0)
     assert done == [new]
     assert old.is_file()
@@ -98,6 +104,8 @@ def test_space_captures_wherever_the_focus_is(run: CaptureRun, browser: Browser)
             browser.devtools("Input.dispatchKeyEvent", type=kind, code="Space", key=" ", windowsVirtualKeyCode=32)
         until(lambda: len(run.session.captures) == 1)
         assert max(cell.pose().moved(before)) < 1e-9, "the button was not pressed"
+        browser.devtools("Input.dispatchKeyEvent", type="keyDown", code="Enter", key="Enter", text="\r")
+        until(lambda: max(cell.pose().moved(before)) > 1e-6)
         browser.resize(390, 800)
         time.sleep(0.5)
         assert browser.run("return document.documentElement.scrollWidth") == 390
@@ -141,3 +149,21 @@ def test_an_open_direction_does_not_stop_the_page(run: CaptureRun) -> None:
         run.verdict = CaptureVerdict(symbol="X_BC", said=(), advice=advice)
         gain = json.loads(json.dumps(run.values(), allow_nan=False))["gain"]
         assert gain == (0.5 if before == 2e-3 else None)
+
+
+def test_the_page_of_a_scanner_on_a_link_jogs_its_joints(browser: Browser, tmp_path: Path) -> None:
+    cell, task = cell_and_task("eye_on_arm", 2)
+    with closing(CaptureRun(CaptureSession(tmp_path / "s", task), cell, cell, 0.4, "demo")) as run:
+        view = CaptureView(task.scene.arm if isinstance(task, CarriedTask) else None)
+        with closing(Dashboard(run, view.url, page="capture")) as page:
+            browser.open(page.url, wait_for="document.querySelectorAll('#jogs button').length > 12")
+            for k in range(4):
+                browser.run("[...document.querySelectorAll('#jogs button')].find(b => b.id === 'go').click()")
+                until(lambda k=k: run.state == READY and run.verdict.advice is not None)  # type: ignore[misc]
+                browser.run("document.querySelector('#capture').click()")
+                until(lambda k=k: len(run.session.captures) == k + 1 and run.state == READY)  # type: ignore[misc]
+                view.show(run)
+            until(lambda: "X_LC" in browser.run("return document.getElementById('matrix').textContent"))
+            assert "Turn the joints: J" in browser.run("return document.getElementById('advice').textContent")
+            assert browser.run("return document.getElementById('ur_pose').textContent")[0] == "["
+            browser.screenshot(tmp_path / "page.png")

@@ -68,6 +68,7 @@ class ProfileTask:
     """Profiles of a laser profiler on the flange; the folder is that of `weldcal profiler edge` or `sphere`."""
 
     symbol, folder, least = "X_FS", "profiles", LEAST
+    hint = "Tilt the flange by 15 to 30 deg about another axis each time, with the target elsewhere in the laser line."
 
     def __init__(self, target: str, robot: str) -> None:
         self._target, self._robot = target, robot

@@ -6,7 +6,6 @@ const SILENT_MS = 3500;
 let heardAt = Date.now(), pictured = 0, last = null;
 
 const say = (id, text) => { const e = el(id); if (e.textContent !== text) e.textContent = text; };
-const FIRST = "Move the flange by 50 to 150 mm and tilt it by 10 to 20 deg from capture to capture, each time in another direction.";
 const show = (id, on) => { el(id).hidden = !on; };
 const ask = (what, value) => fetch("act/" + what, { method: "POST", headers: { "Content-Type": "application/json", "X-Weldcal-Key": key }, body: JSON.stringify({ value }) });
 const capture = () => { if (!el("capture").disabled) ask("capture", el("pose").value); };
@@ -40,7 +39,7 @@ function shown(v) {
   el("back").disabled = busy || v.used || !v.captures.length;
   if (v.picture && v.picture !== pictured) { pictured = v.picture; el("picture").src = "picture/" + v.picture; el("picture").hidden = false; }
   say("gain", v.gain === null ? "" : (100 * v.gain).toFixed(0) + " % less uncertainty");
-  say("advice", v.advice || (v.used ? "Any other pose judges the result." : FIRST));
+  say("advice", v.advice || (v.used ? "Any other pose judges the result." : v.hint));
   say("ur_pose", v.ur_pose || "");
   say("error", v.error_mm === null ? "not yet known" : v.error_mm.toFixed(2) + " mm with 95 %, wanted " + v.required_mm.toFixed(2));
   el("bar").style.width = v.error_mm === null ? "0" : Math.min(100, 100 * v.required_mm / v.error_mm) + "%";
