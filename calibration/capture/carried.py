@@ -100,8 +100,8 @@ class CarriedTask:
         if apart < (_APART_GUESS_M if self._found is None else _APART_M):
             return ""
         return (
-            f"This scan and {one.id} put the circle {1e3 * apart:.0f} mm apart, by the poses of the arm: the pose or the"
-            " scan is an older one, a TCP is set at the robot, or something was moved."
+            f"This scan and {one.id} put the circle {1e3 * apart:.0f} mm apart, by the poses of the arm: the pose or"
+            " the scan is an older one, a TCP is set at the robot, or something was moved."
         )
 
     def forget(self, id: str, shunned: ArmPose | None = None) -> None:
@@ -218,7 +218,7 @@ class CarriedTask:
         return np.asarray(X_CR.inverse() @ one.observation.p_CM)
 
     def _joints(self, pose: ArmPose) -> Joints:
-        """Return the joints of the arm at a pose, as `calibrate` takes them. Raises InputError where they are unknown."""
+        """Return the arm's joints at a pose, as `calibrate` takes them. Raises InputError where they are unknown."""
         arm, q, on_link = self.scene.arm, pose.q, self.scene.link != FLANGE
         if q is not None and pose.X_BF is not None:
             q = q if self.scene.frames(q)[FLANGE].IsNearlyEqualTo(pose.X_BF, SAME) else None

@@ -161,7 +161,7 @@ class CaptureTask(Protocol):
         """Return what a file shows, taken at a pose, and why it cannot be used ("": it can)."""
 
     def repeats(self, one: Capture, other: Capture) -> str:
-        """Say that both show the same though the arm has moved; "" where they do not."""
+        """Return why both show one place though the arm has moved; "" where they do not."""
 
     def contradicts(self, one: Capture, other: Capture) -> str:
         """Say how the move from one capture to the other contradicts that of the arm; "" where it does not."""

@@ -373,7 +373,7 @@ def _facing(p: Array, rng: np.random.Generator) -> RotationMatrix:
 
 
 def _light(grey: NDArray[np.uint8]) -> str:
-    """Say what is wrong with the light of a picture; "" where nothing is."""
+    """Return what is wrong with the light of a picture; "" where nothing is."""
     low, high = np.percentile(grey, [2.0, 98.0])
     if high < _DARK:
         return "it is dark; expose for longer"

@@ -121,7 +121,7 @@ def _serve(run: CaptureRun, browser: bool, robot: str) -> None:
 
 
 def _carried(scenario: str, seed: int) -> CarriedTask | None:
-    """Return the task of a scenario whose scanner is carried by the arm; None where it stands beside it."""
+    """Return the task of a scenario whose scanner is carried by the arm; None where it does not move."""
     from weldcal.systems.jobs.mounting.job import mounting_plan, mounting_scene
     from weldcal.systems.scenario.loading import load_scenario
 

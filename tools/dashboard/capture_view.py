@@ -100,6 +100,6 @@ class CaptureView:
 
 
 def _worth(off: float) -> Rgba:
-    """The colour of a scan by its disagreement over the required error: green to half, yellow at one, red from two."""
+    """The colour of a scan by its disagreement over the required error: green at half, yellow at one, red at two."""
     at = float(np.clip(np.log2(max(off, 0.1)), -1.0, 1.0))
     return Rgba(*(float(np.interp(at, (-1.0, 0.0, 1.0), c)) for c in _FROM_GOOD_TO_BAD))
