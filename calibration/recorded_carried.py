@@ -146,10 +146,13 @@ def calibrate_carried(
     flange: str | None = None,
     poses: str | None = None,
     tell: Callable[[str, float], None] = lambda step, fraction: None,
+    known: dict[tuple[str, ...], CarriedCalibration] | None = None,
 ) -> RecordedCarried:
     """Calibrate from scans at rest as the live job does, scan by scan.
 
-    ``robot``, ``flange`` override dataset.yaml; ``poses``: see FlangeOptions.
+    ``robot``, ``flange`` override dataset.yaml; ``poses``: see FlangeOptions. ``known``: the calibration by the ids of
+    the scans that were looked at, which grows: a session that adds a scan looks at that one only. What it found about
+    the home of fewer scans differs in the last digits.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
@@ -159,13 +162,16 @@ def calibrate_carried(
     scene, circle = recorded_scene(data, robot or data.header.robot, flange or data.header.flange)
     joints = recorded_joints(data, scene)
     found, left = CarriedCalibration(refused=data.refused), list(data.clouds)
+    known, looked = {} if known is None else known, tuple[str, ...]()
     for _ in range(2):  # what is not found about the guess may be found about the result
         for k, id in enumerate(left):
             tell("finding circles", 0.8 * k / len(left))
+            looked = (*looked, id)
             try:
-                found = found.with_scan(scene, circle, id, data.cloud(id), joints[id])
+                found = known.get(looked) or found.with_scan(scene, circle, id, data.cloud(id), joints[id])
             except CloudError as problem:
                 found = found.refusing(id, str(problem))
+            known[looked] = found
         left = [id for id in left if id in dict(found.refused)]
         if found.result is None:
             break

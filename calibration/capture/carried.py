@@ -54,7 +54,7 @@ class CarriedTask:
         self._header, self.scene, self._circle, self._plan = header, scene, circle, plan
         self.symbol, self.least = scene.mounting.unknowns["X"].symbol, fewest(scene)
         self._found: CarriedCalibration | None = None
-        self._seen = dict[str, ObservedCircle]()
+        self._seen, self._known = dict[str, ObservedCircle](), dict[tuple[str, ...], CarriedCalibration]()
         self._shunned: list[Array] = []
         self._poses: tuple[MountingPose, ...] | None = None
 
@@ -107,6 +107,7 @@ class CarriedTask:
     def forget(self, id: str, shunned: ArmPose | None = None) -> None:
         """See CaptureTask."""
         self._seen.pop(id, None)
+        self._known = {ids: found for ids, found in self._known.items() if id not in ids}
         if shunned is not None:
             self._shunned.append(self._joints(shunned)[0])
 
@@ -119,7 +120,7 @@ class CarriedTask:
     def solve(self, folder: Path, last: ArmPose) -> CaptureVerdict:
         """See CaptureTask."""
         try:
-            found = calibrate_carried(folder).found
+            found = calibrate_carried(folder, known=self._known).found
         except TooFewPoses as refusal:
             return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=self.first_pose(last))
         result = found.result

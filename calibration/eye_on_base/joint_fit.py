@@ -87,8 +87,10 @@ def estimate_jointly(
     fit = _fit(good, patterns, rigid.X_BC, config.seed, whole=True)
     corrected = [corrected_observation(fit.correction, o) for o in observations]
     found, applied = fit.found, fit.corrects
+    assert found.X_BC is not None
+    asked = with_scanner(rigid, found.correction, found.X_BC, found.joint, found.redundancy)
     estimate = replace(
-        with_scanner(rigid, fit.correction, fit.X_BC, found.joint, found.redundancy),
+        asked if applied else left_uncorrected(rigid, asked),
         position_residuals_m=position_errors(fit.X_BC, corrected),
         tilt_residuals_rad=tilt_errors(fit.X_BC, corrected),
         held_out=_held_out(observations, patterns, rigid, fit, config.seed),
