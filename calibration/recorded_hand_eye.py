@@ -25,7 +25,7 @@ from weldcal.calibration.hand_eye.pairs.files import NO_MOUNTING, PosePairs, rea
 from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
 from weldcal.calibration.hand_eye.pictures.search import Picture
-from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
+from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_corners, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
@@ -75,8 +75,6 @@ class HandEyeOptions:
         asked = self
         if self.board is not None and self.camera is not None and Path(self.camera).is_file():
             asked = replace(self, intrinsics=Path(self.camera), camera=None)
-        if asked.intrinsics is not None and asked.board is None:
-            raise InputError("A camera file (--as intrinsics) goes with pictures: name the board in them with --board.")
         otherwise = self.motions or self.corners is False or self.refine is not None or self.equation == "axb-ycz"
         if self.board is not None and otherwise:
             without = "--as motions, --no-corners and --refine"
@@ -192,6 +190,12 @@ def _read(
             file, board, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics, known=known
         )
         return shots.pairs, None, shots
+    plain = asked.motions or asked.refine is not None or asked.equation == "axb-ycz"
+    given = read_corners(file, mounting=mounting, unit=unit, stated=stated, camera=asked.intrinsics)
+    if given is not None and not plain:
+        return given.pairs, None, given
+    if asked.intrinsics is not None:
+        raise InputError("A camera file (--as intrinsics) goes with pictures: name the board in them with --board.")
     if asked.motions:
         return read_pairs(file, mounting=mounting, length=unit, stated=replace(stated, decide=False)), None, None
     return *pairs_or_streams(file, mounting=mounting, unit=unit, stated=stated, usual="eye_in_hand"), None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
@@ -56,12 +57,25 @@ class CameraFile:
         distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ..., 5 or more.
         size: width and height of its pictures, px; None where the file does not state it.
         model: the file's words for its lens.
+        covariance: of fx, fy, cx, cy and the distortion, (4 + d, 4 + d), zero for numbers that are fixed; None where
+            the file does not state it.
     """
 
     K: Array
     distortion: Array
     size: tuple[int, int] | None
     model: str = ""
+    covariance: Array | None = None
+
+    @property
+    def numbers(self) -> Array:
+        """fx, fy, cx, cy and the distortion, (4 + d,)."""
+        return np.concatenate([self.K[[0, 1, 0, 1], [0, 1, 2, 2]], self.distortion])
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Places of the numbers that the file states with a covariance."""
+        return np.flatnonzero(np.diag(np.zeros((1, 1)) if self.covariance is None else self.covariance) > 0.0)
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -90,7 +104,27 @@ def read_camera(path: Path) -> CameraFile:
         )
     if not (np.abs([*K.ravel(), *dist]) <= LARGEST_NUMBER).all() or min(K[0, 0], K[1, 1]) <= 1.0:
         raise DatasetError(f"'{name}' holds a focal length that is no number of pixels above 1; {_NEEDED}.")
-    return replace(found, distortion=np.append(dist, 0.0) if dist.size == 4 else dist)
+    found = replace(found, distortion=np.append(dist, 0.0) if dist.size == 4 else dist)
+    C, m = found.covariance, 4 + found.distortion.size
+    if C is None:
+        return found
+    if C.size != m**2 or not (np.abs(C) <= LARGEST_NUMBER).all():
+        raise DatasetError(f"'{name}' holds a covariance of {C.size} numbers; {m} x {m} of finite ones are needed.")
+    C = 0.5 * (C.reshape(m, m) + C.reshape(m, m).T)
+    some = np.diag(C) > 0.0
+    if np.diag(C).min() < 0.0 or C[~some].any() or not (np.linalg.eigvalsh(C[some][:, some]) > 0.0).all():
+        raise DatasetError(f"'{name}' holds a covariance that is none: it has a variance that is not positive.")
+    return replace(found, covariance=C)
+
+
+def camera_document(camera: CameraFile) -> dict[str, Any]:
+    """Return the contents of a camera file as ROS and OpenCV read it, with the key ``covariance`` for weldcal."""
+    width, height = camera.size or (0, 0)
+    arrays = {"camera_matrix": camera.K, "distortion_coefficients": camera.distortion[None]}
+    if camera.covariance is not None:
+        arrays["covariance"] = camera.covariance
+    forms = {k: {"rows": v.shape[0], "cols": v.shape[1], "data": v.ravel().tolist()} for k, v in arrays.items()}
+    return {"image_width": int(width), "image_height": int(height), "distortion_model": "plumb_bob", **forms}
 
 
 def find_camera(path: Path) -> CameraFile | None:
@@ -171,7 +205,8 @@ def _camera(node: Mapping[str, Any]) -> CameraFile | None:
         if plain.get("kud") is not None:  # ViSP: u = u0 + px x (1 + kud r2)
             named[0] = as_number(plain["kud"])
         dist = np.array([v if np.isfinite(v) else 0.0 for v in named])
-    return CameraFile(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), dist, _size(plain), model.lower())
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return CameraFile(K, dist, _size(plain), model.lower(), _values(plain.get("covariance")))
 
 
 def _size(plain: Mapping[str, Any]) -> tuple[int, int] | None:

@@ -96,7 +96,7 @@ def test_a_shell_completes_names_without_a_heavy_import() -> None:
     environment = os.environ | {"_WELDCAL_COMPLETE": "complete_bash", "COMP_WORDS": "weldcal c", "COMP_CWORD": "1"}
     done = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["capture", "calibrate", "check-robot", "check-cell"]
+    assert done.stdout.split() == ["capture", "calibrate", "camera", "check-robot", "check-cell"]
 
 
 def test_help_loads_no_heavy_library() -> None:

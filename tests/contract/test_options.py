@@ -20,6 +20,7 @@ VALUES = {"robot-form": "euler_xyz,deg", "camera-form": "matrix,inverse", "intri
 VALUES |= {"motions": "", "trial": "0", "side": "right", "z": "away"}
 ARGUMENTS = dict.fromkeys(("profiler clock", "profiler seam"), ("--calibration", "c"))
 ARGUMENTS["profiler step"] = ("--height", "10")
+ARGUMENTS["camera"] = ("--board", "chessboard:9x6:25")
 ARGUMENTS["verify"] = ("no_such", "--board", "chessboard:9x6:25")
 KEYED = [(name.partition(" ")[2], key) for name, made in LEAVES.items() for key in getattr(made, "keys", ())]
 

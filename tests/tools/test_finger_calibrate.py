@@ -121,11 +121,11 @@ def done(pictures: Path, touches: Path) -> dict[str, object]:
 def test_the_camera_is_the_one_that_took_the_pictures(done: dict[str, dict[str, float]]) -> None:
     camera = done["camera"]
     found = np.array([camera[key] for key in ("fx", "fy", "cx", "cy")])
-    # 12 pictures of 35 corners at some 0.1 px: focal length and principal point to a fraction of a percent
+    # 16 pictures of 35 corners at some 0.1 px: focal length and principal point to a fraction of a percent
     assert np.abs(found - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).max() < 2.0
     assert camera["rms_px"] < 0.2
     assert camera["held_out_px"] < 0.25
-    assert (camera["pictures"], camera["held_out_pictures"]) == (12, 4)
+    assert (camera["pictures"], camera["held_out_pictures"]) == (16, 4)
     assert done["without_board"] == ["99.png"]
 
 

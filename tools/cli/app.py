@@ -28,7 +28,7 @@ DEFAULTS = {"hand-eye": "ax-yb"}
 
 PANELS = {
     "Calibrate": (
-        *("capture", "calibrate", "verify", "apply", "hand-eye", "profiler", "tablet", "plan-poses"),
+        *("capture", "calibrate", "verify", "apply", "camera", "hand-eye", "profiler", "tablet", "plan-poses"),
         *("doctor", "monitor", "fleet"),
     ),
     "Weld": ("demo", "weld", "plan-passes", "part", "new", "finger", "tool"),

@@ -15,7 +15,7 @@ JOURNAL = "tasks.jsonl"
 RESULTS = (
     "report.html", "calibration.yaml", "monitor.json", "verification.json", "run.json", "runs.csv", "summary.txt",
     "board.pdf", "tool.html", "finger.yaml", "edges.csv", "findings.json", "best.script", "poses.script", "touches.csv",
-    "progress.json",
+    "camera.yaml", "progress.json",
 )  # fmt: skip
 """Files by which a folder is known to hold a result."""
 _PATIENCE_S = 1.0  # for the number of a process that has just created its file

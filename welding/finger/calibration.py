@@ -3,43 +3,17 @@
 The camera's intrinsics from pictures of a board, the tag's size and the tip from touches on a plate.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 
-FEWEST_PICTURES, FEWEST_CORNERS = 6, 8
-HELD_OUT = 4  # every fourth picture judges and is not used
-WORST_PX = 1.0  # OpenCV's corners of a sharp picture are good to some tenths; above 1 px a corner is a wrong one
-LEAST_TILT_DEG = 8.0  # the board is turned by so much in some pictures: else focal length and distance are one number
 FEWEST_TOUCHES = 4
 LEAST_PRESS_M = 5e-4  # a choice: about ten times the tag's own noise at the tip, a sixth of the weld's deflection
 FAR_OFF = 0.2  # of the nominal size: a tag that is further off is another tag
 AXES = ("x", "y", "z")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FingerIntrinsics:
-    """Hold a calibrated camera.
-
-    K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the pictures that were
-    used and of those that were not, their numbers, and the standard deviation of the focal length in px.
-    """
-
-    K: Array
-    distortion: Array
-    width: int
-    height: int
-    rms_px: float
-    held_out_px: float
-    used: int
-    held_out: int
-    focal_sigma_px: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,81 +34,6 @@ class TipCalibration:
     stiffness_N_per_m: dict[str, float]
     held_out_m: float
     unknown: tuple[str, ...]
-
-
-def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tuple[Array, Array] | None:
-    """Corners of the board in a grey picture: points on the board (n, 3) m and pixels (n, 2).
-
-    None where too few are seen.
-    """
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
-    if corners is None or len(corners) < FEWEST_CORNERS:
-        return None
-    return np.asarray(board.getChessboardCorners(), dtype=float)[ids.ravel()], np.asarray(corners, dtype=float).reshape(
-        -1, 2
-    )
-
-
-def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> FingerIntrinsics:
-    """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture.
-
-    Every fourth picture is held out.
-
-    Zhang, A flexible new technique for camera calibration, 2000, with two radial and two tangential coefficients
-    (OpenCV).
-
-    Raises:
-        InputError: too few pictures, a board that is never turned, or a fit worse than a pixel.
-    """
-    if len(seen) < FEWEST_PICTURES:
-        raise InputError(
-            f"{len(seen)} pictures show the board, and {FEWEST_PICTURES} are needed: take more, filling the picture."
-        )
-    judges = list(seen[HELD_OUT - 1 :: HELD_OUT])
-    used = [views for k, views in enumerate(seen) if k % HELD_OUT != HELD_OUT - 1]
-    points = [np.asarray(p, dtype=np.float32) for p, _ in used]
-    pixels = [np.asarray(u, dtype=np.float32) for _, u in used]
-    rms, K, distortion, turns, _, sigmas, _, _ = cv2.calibrateCameraExtended(
-        points,
-        pixels,
-        size,
-        None,
-        None,
-        flags=cv2.CALIB_FIX_K3,  # type: ignore[call-overload]
-    )
-    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
-    tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
-    if np.sort(tilts)[-3:].min() < LEAST_TILT_DEG:
-        raise InputError(
-            f"The board is turned by at most {tilts.max():.0f} degrees: tilt it by 20 to 40 degrees to all sides."
-            " Otherwise its distance and the focal length cannot be separated."
-        )
-    if rms > WORST_PX:
-        raise InputError(
-            f"The corners of the board are {rms:.2f} px off: give the board's true --board (measure a square), keep it"
-            " flat, and take sharp pictures."
-        )
-    errors = [_reprojection(np.asarray(p), np.asarray(u), K, distortion) for p, u in judges]
-    held_out = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-    focal_sigma = float(np.ravel(sigmas)[0])
-    return FingerIntrinsics(
-        K=np.asarray(K),
-        distortion=np.ravel(distortion),
-        width=size[0],
-        height=size[1],
-        rms_px=float(rms),
-        held_out_px=held_out,
-        used=len(used),
-        held_out=len(judges),
-        focal_sigma_px=focal_sigma,
-    )
-
-
-def _reprojection(points: Array, pixels: Array, K: Array, distortion: Array) -> Array:
-    """Distances (n,) px of a board's corners from where its best pose puts them."""
-    _, turn, shift = cv2.solvePnP(points, pixels, K, distortion)
-    projected, _ = cv2.projectPoints(points, turn, shift, K, distortion)
-    return np.asarray(np.linalg.norm(projected.reshape(-1, 2) - pixels, axis=1))
 
 
 def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = None) -> TipCalibration:

@@ -57,6 +57,7 @@ class Board:
         id: number of the tag (kind tag).
         layout: 1 for OpenCV's ChArUco layout before 4.6; for tags order of numbers and first corner, see ``layouts``.
         radius: of circles, m, as the pictures show it; 0 until then.
+        given: points m of a board of another detector (kind "corners"), which no string describes.
     """
 
     kind: str
@@ -68,6 +69,7 @@ class Board:
     id: int = 0
     layout: int = 0
     radius: float = 0.0
+    given: tuple[tuple[float, ...], ...] = ()
 
     def __str__(self) -> str:
         """Return the string that describes the board."""
@@ -95,8 +97,8 @@ class Board:
         """Points (m, 3) m of the board in its frame, row by row; of tags four corners clockwise from the upper left."""
         xy: NDArray[np.floating[Any]]
         j, i = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        if self.kind == "charuco":
-            return np.asarray(self.opencv.getChessboardCorners(), dtype=float)
+        if self.given or self.kind == "charuco":
+            return np.array(self.given or self.opencv.getChessboardCorners(), dtype=float)
         if self.kind in ("tag", "tags"):
             corner = self.size * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
             corner = corner - 0.5 * self.size if self.kind == "tag" else corner
@@ -213,15 +215,9 @@ def _check(kind: str, found: dict[str, Any], text: str) -> None:
 def find_board(grey: Grey, board: Board) -> Array:
     """Points (m, 2) px of a board in a picture, NaN where not found; the first pixel's centre is (0, 0)."""
     none = np.full((len(board.points), 2), np.nan)
-    found: Array | None
-    if board.kind == "chessboard":
-        found = _chessboard(grey, board)
-    elif board.kind == "charuco":
-        found = _charuco(grey, board)
-    elif board.kind in ("tag", "tags"):
-        found = _tags(grey, board)
-    else:
-        found = find_circles(grey, board)[0]
+    finders = {"chessboard": _chessboard, "charuco": _charuco, "tag": _tags, "tags": _tags}
+    find = finders.get(board.kind)
+    found = find_circles(grey, board)[0] if find is None else find(grey, board)
     return none if found is None else found
 
 

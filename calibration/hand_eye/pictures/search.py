@@ -40,6 +40,8 @@ _CAMERA = re.compile(
     r"|sensor|param|params)$"
 )
 _CAMERA_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".txt", ".npz")
+FREE = np.arange(8)
+"""Numbers of a camera that are estimated: fx, fy, cx, cy, k1, k2, p1, p2."""
 FEWEST = 4
 """Pictures with the board that are needed."""
 _CENTRAL = 0.3  # a choice: shares of width and height between which any lens has its principal point
@@ -281,7 +283,7 @@ def _estimate(
                 f" from the middle of pictures of {size[0]} x {size[1]} pixels: it is for another resolution. Give the"
                 " file of this one, or leave it out: the camera is then estimated."
             )
-        return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
+        return file.K, file.distortion, file.free, pictures
     start = np.array(
         [[1.2 * max(size), 0.0, 0.5 * size[0] - 0.5], [0.0, 1.2 * max(size), 0.5 * size[1] - 0.5], [0.0, 0.0, 1.0]]
     )
@@ -307,7 +309,7 @@ def _estimate(
         for k, e in zip(np.array(kept)[bad], error[bad], strict=True):
             pictures[k] = replace(pictures[k], why=f"Its points do not fit the camera of the others ({e:.1f} px).")
     K, dist = np.asarray(found[1], dtype=float), np.ravel(np.asarray(found[2], dtype=float))[:5]
-    free = np.arange(8)
+    free = FREE
     if not few:
         more = cv2.calibrateCamera(obj, img, size, K.copy(), dist.copy(), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
         numbers = 2.0 * sum(len(o) for o in obj)
@@ -380,3 +382,11 @@ def solutions(points: Array, board: Board, K: Array, dist: Array) -> list[tuple[
         error = float(np.sqrt(((np.asarray(uv)[:, 0] - img) ** 2).sum(axis=1).mean()))
         found.append((error, pose(exp_rotation(np.ravel(w)), np.ravel(t))))
     return sorted(found, key=lambda one: one[0])
+
+
+def reprojection(points: Array, obj: Array, C: Array, K: Array, dist: Array) -> Array:
+    """Squared distances px of a picture's points (m, 2) from the board's (m, 3) in the best pose near C."""
+    seen = np.isfinite(points[:, 0])
+    w, t = cv2.solvePnPRefineLM(obj[seen], points[seen], K, dist, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3:].copy())
+    uv = cv2.projectPoints(obj[seen], w, t, K, dist)[0]
+    return np.asarray(((np.asarray(uv)[:, 0] - points[seen]) ** 2).sum(axis=1))

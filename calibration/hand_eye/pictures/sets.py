@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.camera_file import CameraFile, read_camera
-from weldcal.calibration.data.poses.listing import Listing, listing_of
+from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.lists import folder_lists, together, without_copies
 from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import angle_of, nearest_rotation, pose
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
-from weldcal.calibration.hand_eye.pairs.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.files import NO_MOUNTING, PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import Board
 from weldcal.calibration.hand_eye.pictures.search import (
@@ -32,8 +32,10 @@ from weldcal.calibration.hand_eye.pictures.search import (
     solutions,
     spread,
 )
+from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 
+_FLAT = 1e-3  # of its width: a flat board's points are stated in one plane
 _TRIED_SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 
 
@@ -48,6 +50,7 @@ class PictureSet:
         board: the board.
         camera: the file that states the camera, or empty where it is estimated.
         free: the camera's numbers that are estimated, see ``adjust``.
+        stated: what that file states; None without one.
     """
 
     pairs: PosePairs
@@ -56,6 +59,7 @@ class PictureSet:
     board: Board
     camera: str
     free: NDArray[np.int64]
+    stated: CameraFile | None = None
 
 
 def read_pictures(
@@ -102,6 +106,60 @@ def read_pictures(
     robot = _robot(folder, stated, skip, unit)
     board, pictures = find_in(files, board, folder.name, known)
     return picture_set(pictures, board, robot, mode, folder.name, stated=stated, camera=stated_camera, named=camera)
+
+
+def read_corners(
+    path: Path, *, mounting: str | None, unit: str | None, stated: StatedForms, camera: Path | None
+) -> PictureSet | None:
+    """Return the corners of another detector as pictures, from an npz file of A, img, obj and size; None of others.
+
+    Args:
+        path: the file, or a folder with pairs.npz. Without B the poses of the board follow from the corners; without K
+            the camera is estimated.
+        mounting, unit, stated, camera: as of ``read_pictures``.
+
+    Raises:
+        DatasetError: the arrays do not belong together.
+    """
+    path = path / "pairs.npz" if path.is_dir() else path
+    raw = read_npz(path) if path.suffix.lower() == ".npz" and path.is_file() else {}
+    if "B" in raw or not {"A", "img", "obj"} <= set(raw):
+        return None
+    name = path.name
+    if "size" not in raw and "K" not in raw:
+        raise DatasetError(f"'{name}' holds corners and no K: add 'size', the width and height of its pictures in px.")
+    robot, img, obj = listing_of_array("A", raw["A"]), raw["img"].astype(float), raw["obj"].astype(float)
+    if img.shape != (len(robot), len(obj), 2) or obj.ndim != 2 or obj.shape[1] != 3 or len(obj) < 4:
+        raise DatasetError(
+            f"'{name}' holds img {img.shape} and obj {obj.shape} for {len(robot)} poses: they must be"
+            " (poses, points, 2) and (points, 3), with four points or more."
+        )
+    if not np.isfinite(obj).all() or float(np.ptp(obj[:, 2])) > _FLAT * float(np.ptp(obj[:, :2])):
+        raise DatasetError(f"'{name}' holds points obj that do not lie in one plane z of the board: give a flat board.")
+    mode = mounting_name(mounting or str(np.ravel(raw.get("mode", ""))[0]))
+    if mode not in ("eye_in_hand", "eye_on_base"):
+        raise DatasetError(NO_MOUNTING.format(name))
+    size = np.ravel(raw["size"]).astype(int) if "size" in raw else np.ceil(2.0 * raw["K"][:2, 2]).astype(int) + 1
+    file = None if camera is None else (camera, read_camera(camera))
+    if file is None and "K" in raw:
+        file = path, CameraFile(K=raw["K"], distortion=np.ravel(raw.get("dist", np.zeros(5))), size=None)
+    pictures = [
+        Picture(
+            name=f"{k:04d}",
+            points=np.where(np.isfinite(uv).all(axis=1)[:, None], uv, np.nan),
+            size=(int(size[0]), int(size[1])),
+            thumbnail=b"",
+            why="" if int(np.isfinite(uv).all(axis=1).sum()) >= min(8, len(obj)) else "Fewer than 8 points were found.",
+        )
+        for k, uv in enumerate(img)
+    ]
+    if sum(not p.why for p in pictures) < FEWEST:
+        raise DatasetError(f"'{name}' has {FEWEST - 1} pictures or fewer with 8 points, and {FEWEST} are needed.")
+    gaps = np.linalg.norm(obj[:, None] - obj[None], axis=2) + np.diag(np.full(len(obj), np.inf))
+    pitch, given = float(np.median(gaps.min(axis=1))), tuple(map(tuple, obj.tolist()))
+    board = Board(kind="corners", columns=len(obj), size=pitch, given=given)
+    robot = replace(robot, unit=unit or "", ids=tuple(p.name for p in pictures))
+    return picture_set(pictures, board, robot, mode, name, stated=stated, camera=file, named=camera)
 
 
 def picture_set(
@@ -162,8 +220,8 @@ def picture_set(
         notes=found.notes,
         ids=tuple(turned[k].name for k in rows),
     )
-    stated_by = "" if camera is None or len(free) else camera[0].name
-    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=stated_by, free=free)
+    name = "" if camera is None else camera[0].name
+    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=name, free=free, stated=file)
 
 
 def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str | None) -> Listing:

@@ -12,7 +12,10 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.eye_on_base.test_solve import make_observations
+from tests.calibration.hand_eye.made_boards import Made as MadeBoard
+from tests.calibration.hand_eye.made_boards import seen
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
+from tests.calibration.hand_eye.rendering import SIZE
 from tests.worlds.light_runs import mounted_world
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, statistics
 from weldcal.calibration.data.scanner_correction import ScannerClock
@@ -20,6 +23,9 @@ from weldcal.calibration.eye_on_base.observations import FlangeObservations
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import Convergence
 from weldcal.calibration.hand_eye.mountings import get_mounting
+from weldcal.calibration.hand_eye.pictures.boards import parse_board
+from weldcal.calibration.hand_eye.pictures.camera import CameraEstimate, camera_of
+from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftEvent
@@ -433,22 +439,27 @@ def tablet() -> Made:
     return first, tablet_report(result, shown, first, 0.1)
 
 
+def camera_estimate() -> CameraEstimate:
+    """A camera from pictures of a board that is nowhere quite flat, one picture without it."""
+    world = seen(0, MadeBoard(arm="each", n=8))
+    shots = [Picture(name=f"{k}.png", points=uv, size=SIZE, thumbnail=b"") for k, uv in enumerate(world.img)]
+    lost = replace(shots[0], name="lost.png", why="The board was not found.")
+    return camera_of([*shots, lost], parse_board("chessboard:9x6:20"))
+
+
+def camera() -> Made:
+    """`camera`."""
+    from weldcal.tools.commands.camera import camera_page, camera_screen
+
+    found = camera_estimate()
+    return camera_screen(found), camera_page(found, camera_screen(found), Path("pictures"))
+
+
 def finger() -> Made:
     """`finger calibrate` with touches."""
     from weldcal.tools.commands.cell.finger import FingerReport, finger_page
-    from weldcal.welding.finger.calibration import FingerIntrinsics, TipCalibration
+    from weldcal.welding.finger.calibration import TipCalibration
 
-    camera = FingerIntrinsics(
-        K=np.diag([900.0, 900.0, 1.0]),
-        distortion=np.zeros(5),
-        width=640,
-        height=480,
-        rms_px=0.2,
-        held_out_px=0.3,
-        used=20,
-        held_out=5,
-        focal_sigma_px=1.0,
-    )
     tip = TipCalibration(
         scale=1.0,
         scale_sigma=1e-3,
@@ -459,13 +470,7 @@ def finger() -> Made:
         unknown=("pressed along x only",),
     )
     report = FingerReport(
-        camera=camera,
-        tip=tip,
-        without_board=("lost.png",),
-        tag_size_mm=10.0,
-        tag_at_rest_mm=(0.0, 1.0, 30.0),
-        touches=8,
-        limit_mm=0.05,
+        camera=camera_estimate(), tip=tip, tag_size_mm=10.0, tag_at_rest_mm=(0.0, 1.0, 30.0), touches=8, limit_mm=0.05
     )
     return report.first, finger_page(report, Path("pictures"))
 
@@ -487,6 +492,7 @@ PAGES: dict[str, Callable[[], Made]] = {
         bead,
         profiler_live,
         tablet,
+        camera,
         finger,
     )
 }

@@ -27,6 +27,7 @@ VERDICTS |= {
     "seam": CARE,
     "bead": CARE,
     "tablet": USE,
+    "camera": CARE,
     "finger": CARE,
     "mounting": USE,
     "profiler_live": CARE,

@@ -10,25 +10,19 @@ import yaml
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.checks import read_rows
+from weldcal.calibration.hand_eye.pictures.camera import CameraEstimate, calibrate_camera
 from weldcal.models.array_files import read_grey_image
 from weldcal.models.arrays import Array
-from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import LOOK, Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.cell.board import CharucoBoard
+from weldcal.tools.commands.camera import left_out, named_board
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.page import Bullets, Section, TableRows, page_html
 from weldcal.tools.report.render import write_atomic
-from weldcal.welding.finger.calibration import (
-    FingerIntrinsics,
-    TipCalibration,
-    calibrate_intrinsics,
-    calibrate_tip,
-    find_board,
-)
+from weldcal.welding.finger.calibration import TipCalibration, calibrate_tip
 from weldcal.welding.finger.creep import LoadingError, LoadingEstimate, estimate_loading
 from weldcal.welding.finger.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
 
@@ -129,15 +123,19 @@ def read_loading(table: Path) -> LoadingEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FingerReport:
-    """The camera, the tip (None without touches), pictures without a board, and the tag's pose at rest."""
+    """The camera, the tip (None without touches), and the tag's pose at rest."""
 
-    camera: FingerIntrinsics
+    camera: CameraEstimate
     tip: TipCalibration | None
-    without_board: tuple[str, ...]
     tag_size_mm: float | None = None
     tag_at_rest_mm: tuple[float, ...] | None = None  # p_KM
     touches: int = 0
     limit_mm: float | None = None
+
+    @property
+    def without_board(self) -> tuple[str, ...]:
+        """Names of the pictures that are not used."""
+        return left_out(self.camera)
 
     @property
     def first(self) -> FirstScreen:
@@ -146,17 +144,15 @@ class FingerReport:
         There is no work point: the error of a touch that the fit did not use stands in its place; without
         touches the reprojection of pictures that were left out.
         """
-        c, tip = self.camera, self.tip
+        c, tip, K = self.camera, self.tip, self.camera.camera.K
         concerns = [] if tip is None else [f"Open: {text}" for text in tip.unknown]
         lost = f"The board was not found in {len(self.without_board)} pictures ({', '.join(self.without_board[:4])})."
         notes = [lost] if self.without_board else []
-        pictures = (
-            f"{c.held_out} of {c.held_out + c.used} pictures were left out of the fit: {c.held_out_px:.3f} px rms"
-        )
+        pictures = f"{c.held_out} of {c.used} pictures were left out of a second fit: {c.held_out_px:.3f} px rms"
         more = {
             "camera": (
-                f"focal length {c.K[0, 0]:.2f}, {c.K[1, 1]:.2f} px, +- {c.focal_sigma_px:.2f}; centre {c.K[0, 2]:.2f},"
-                f" {c.K[1, 2]:.2f} px"
+                f"focal length {K[0, 0]:.2f}, {K[1, 1]:.2f} px, +- {c.sigma[0]:.2f}; centre {K[0, 2]:.2f},"
+                f" {K[1, 2]:.2f} px"
             ),
             "pose": "none is computed; the tool file states that of the camera",
         }
@@ -191,22 +187,23 @@ class FingerReport:
 
     def document(self) -> dict[str, Any]:
         """Return the contents of finger.yaml, and the JSON object of the command."""
-        K, c = self.camera.K, self.camera
+        K, c = self.camera.camera.K, self.camera
+        width, height = c.camera.size or (0, 0)
         found: dict[str, Any] = {
             "schema": SCHEMA,
             "camera": {
-                "width": c.width,
-                "height": c.height,
+                "width": int(width),
+                "height": int(height),
                 "fx": float(K[0, 0]),
                 "fy": float(K[1, 1]),
                 "cx": float(K[0, 2]),
                 "cy": float(K[1, 2]),
-                "distortion": [float(v) for v in c.distortion],
+                "distortion": [float(v) for v in c.camera.distortion],
                 "rms_px": c.rms_px,
                 "held_out_px": c.held_out_px,
                 "pictures": c.used,
                 "held_out_pictures": c.held_out,
-                "focal_sigma_px": c.focal_sigma_px,
+                "focal_sigma_px": float(c.sigma[0]),
             },
         }
         if self.tip is not None and self.tag_size_mm is not None:
@@ -238,25 +235,10 @@ def calibrate_finger(
     check_limit(limit_mm)
     if limit_mm is not None and touches is None:
         raise InputError("--limit-mm is measured by touches: give them with --touches, or omit it.")
-    opencv = read_board(board).opencv()
     carrier = load_tool(WELDING if tool is None else tool).tool
-    names = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES) if folder.is_dir() else []
-    if not names:
-        raise InputError(f"'{folder}' holds no pictures: give the folder of the pictures of the board, png or jpg.")
-    seen, without, size = [], [], None
-    for name in names:
-        picture = read_grey_image(name)
-        size = _same_size(size, picture, name)
-        found = find_board(picture, opencv)
-        if found is None:
-            without.append(name.name)
-        else:
-            seen.append(found)
-    assert size is not None
-    camera = calibrate_intrinsics(seen, size)
-    report = FingerReport(camera=camera, tip=None, without_board=tuple(without))
+    report = FingerReport(camera=calibrate_camera(folder, named_board(str(board))), tip=None)
     if touches is not None:
-        report = _with_touches(report, touches, size, carrier)
+        report = _with_touches(report, touches, carrier)
     report = replace(report, limit_mm=limit_mm)
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / "report.html", finger_page(report, folder))
@@ -270,7 +252,7 @@ def finger_page(report: FingerReport, folder: Path) -> str:
     rows = [
         ("reprojection, rms, of the pictures used", f"{c.rms_px:.3f} px"),
         ("of the pictures left out", f"{c.held_out_px:.3f} px"),
-        ("distortion", ", ".join(f"{v:.5f}" for v in c.distortion)),
+        ("distortion", ", ".join(f"{v:.5f}" for v in c.camera.distortion)),
     ]
     if t is not None and report.tag_size_mm is not None:
         seat = ", ".join("open" if np.isnan(v) else f"{1e3 * v:.3f}" for v in t.seat_m)
@@ -290,33 +272,22 @@ def finger_page(report: FingerReport, folder: Path) -> str:
     return page_html(title, subtitle, sections, first=report.first)
 
 
-def read_board(path: Path) -> CharucoBoard:
-    """The board that `weldcal print-board` described. Raises InputError where the file is no such description."""
-    try:
-        keys = dict(read_document(path)["board"])
-        board = CharucoBoard(**keys)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}' describes no board: give the board.yaml that weldcal print-board wrote.") from error
-    return board
-
-
-def _same_size(size: tuple[int, int] | None, picture: NDArray[np.uint8], name: Path) -> tuple[int, int]:
+def _require_size(size: tuple[int, int] | None, picture: NDArray[np.uint8], name: Path) -> None:
     found = (picture.shape[1], picture.shape[0])
     if size is not None and found != size:
         raise InputError(
             f"'{name.name}' is {found[0]} x {found[1]}, and the others are {size[0]} x {size[1]}: use one camera mode."
         )
-    return found
 
 
-def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool: WeldingTool) -> FingerReport:
+def _with_touches(report: FingerReport, table: Path, tool: WeldingTool) -> FingerReport:
     """Return the report with what the touches show."""
     header, rows = read_rows(table)
     if not {"picture", *COLUMNS} <= set(header):
         raise InputError(
             f"'{table.name}' needs the columns picture, {', '.join(COLUMNS)}; forces are fx_N, fy_N, fz_N."
         )
-    camera = report.camera
+    camera = report.camera.camera
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
     R_TK = tool.X_FT.rotation().inverse() @ tool.X_FK.rotation()
     rest: TagObservation | None = None
@@ -324,7 +295,7 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
     for line, row in enumerate(rows, 2):
         name = table.parent / row["picture"]
         picture = read_grey_image(name)
-        _same_size(size, picture, name)
+        _require_size(report.camera.camera.size, picture, name)
         found = detect_tag(picture, camera.K, tag, distortion=camera.distortion)
         if not found.valid or found.X_KM is None:
             raise InputError(f"'{table.name}', line {line}: no tag was found in {row['picture']}: {found.reason}")
@@ -344,9 +315,8 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
     assert rest.X_KM is not None
     at_rest = tuple(float(1e3 * v / tip.scale) for v in rest.X_KM.translation())
     return FingerReport(
-        camera=camera,
+        camera=report.camera,
         tip=tip,
-        without_board=report.without_board,
         tag_size_mm=1e3 * tag.size_m / tip.scale,
         tag_at_rest_mm=at_rest,
         touches=len(pressed),
