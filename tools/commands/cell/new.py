@@ -103,7 +103,7 @@ CANNOT_WELD = """# A cell of your own, unfinished: the arm cannot weld the seam 
 @command("new", common=("seed", "json", "debug"), short_help="Write a cell or a dataset of your own to start from.")
 def new(
     call: Call,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.", writable=True)],
     base: Annotated[str, option("--from", "NAME", "Scenario that the cell begins as, by name or path.")] = BASE,
     part: Annotated[
         Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")
