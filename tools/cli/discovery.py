@@ -20,7 +20,7 @@ from typer.models import ArgumentInfo
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.cli.options import CliCommand
+from weldcal.tools.cli.options import CliCommand, check_writable
 
 PACKAGES = ("weldcal.tools.commands", "weldcal.tools.cli")
 """Packages whose modules, at any depth, hold the commands of weldcal."""
@@ -51,7 +51,10 @@ class Entry:
         found: CliCommand = _made(self.module, tree, {command.name})[command.name]
 
         def call(**given: Any) -> None:
+            found.read(given)
             with console.boundary(json_wanted=given.get("json", False), debug=given["debug"]):
+                if given.get("out") is not None:
+                    check_writable(given["out"])
                 _check_paths(found, given)
                 whole = self.load()
             whole.function(**given)
@@ -112,9 +115,13 @@ def _bound(statement: ast.stmt) -> dict[str, str]:
 def _check_paths(command: CliCommand, given: Mapping[str, Any]) -> None:
     """Refuse a path that is not there before the imports. An argument that is written has `writable`.
 
+    A scenario in place of an argument is wrong usage, which the command says.
+
     Raises:
         InputError: it names the path, and says what the argument is.
     """
+    if given.get("scenario") is not None:
+        return
     for name, parameter in inspect.signature(command.function).parameters.items():
         info = next(iter(getattr(parameter.annotation, "__metadata__", ())), None)
         if isinstance(info, ArgumentInfo) and not info.writable:
