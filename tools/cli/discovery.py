@@ -64,7 +64,8 @@ class Entry:
 
 def _origin(module: str) -> str:
     spec = importlib.util.find_spec(module)
-    assert spec is not None and spec.origin is not None, module
+    assert spec is not None
+    assert spec.origin is not None
     return spec.origin
 
 
