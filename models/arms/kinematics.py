@@ -298,7 +298,7 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
 
 def _read_kinematics(path: Path) -> tuple[Array, str]:
     """Link transforms (6, 4, 4) and the calibration hash of a kinematics file."""
-    section = dict(*_read(path, "kinematics"))
+    section: dict[str, Any] = dict(*_read(path, "kinematics"))
     fingerprint = str(section.pop("hash", ""))
     for found, wanted, where in [(section, LINKS, "kinematics")] + [
         (section.get(link), POSE_KEYS, f"kinematics.{link}") for link in LINKS
