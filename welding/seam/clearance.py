@@ -119,12 +119,14 @@ def check_beside(
     body = np.vstack([a + share * (b - a) for a, b, _ in spans])
     swept = cKDTree(np.vstack([tip.position + (body + lift * upward / NEAR_TIP_M) @ R.T for _, lift, tip, R in held]))
     reach = max(radius for _, _, radius in spans) + STEP_BESIDE_M
-    near = points_B[np.asarray(swept.query(points_B, distance_upper_bound=reach)[0]) < reach]
+    near = _boxed(points_B, np.asarray(swept.data), reach)
+    near = near[np.asarray(swept.query(near, distance_upper_bound=reach)[0]) < reach]
     if len(near) < 2:
         return
-    surface = cKDTree(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0])
+    samples = _boxed(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0], near, 2.0 * OTHER_M)
+    surface = cKDTree(samples, balanced_tree=False, compact_nodes=False)
     pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
-    other = near[np.asarray(surface.query(near)[0]) > OTHER_M]
+    other = near[np.asarray(surface.query(near, distance_upper_bound=2.0 * OTHER_M)[0]) > OTHER_M]
     flat = other[:, 2] < table_z_m + OTHER_M
     least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
     before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
@@ -158,6 +160,12 @@ def check_beside(
                 raise NoClearance(
                     f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M
                 )
+
+
+def _boxed(points: NDArray[np.float64], about: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
+    """Return the points (N,3) m that are not farther than `reach_m` from the box about others (M,3)."""
+    low, high = about.min(axis=0) - reach_m, about.max(axis=0) + reach_m
+    return points[((points >= low) & (points <= high)).all(axis=1)]
 
 
 def clear_pieces(

@@ -68,6 +68,7 @@ class SchemaKey:
         return isinstance(self.kind, UnionType) and NoneType in get_args(self.kind)
 
 
+@cache
 def keys_of(config: type) -> tuple[SchemaKey, ...]:
     """Return the keys of a dataclass, those of its base classes included, in their order."""
     comments: dict[str, str] = {}
