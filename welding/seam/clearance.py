@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -66,7 +67,7 @@ def check_clearance(
     Raises:
         NoClearance: less than 1 mm, with the place.
     """
-    points, _ = mesh.sample(SAMPLES, np.random.default_rng(0))
+    points = _sampled(mesh)
     points_B = points @ X_BP.rotation().matrix().T + X_BP.translation()
     spans = [span for capsule in capsules if (span := _above_tip(capsule, X_FT)) is not None]
     last = min(seam.drawn_m, seam.length + chord_m)
@@ -82,6 +83,12 @@ def check_clearance(
                     " finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
                 )
+
+
+@lru_cache(4)
+def _sampled(mesh: TriMesh) -> NDArray[np.float64]:
+    """Return points (N,3) m on a mesh: the same for every edge of a part."""
+    return mesh.sample(SAMPLES, np.random.default_rng(0))[0]
 
 
 def check_beside(
