@@ -33,7 +33,7 @@ EXAMPLES = {
     "tags": "tags:4x3:40:10:4X4_50 (4 x 3 tags of 40 mm, gaps of 10 mm)",
 }
 _LARGEST_MM, _MOST = 5000.0, 60
-_LARGE_PX = 1750  # beyond it a chessboard is searched in reduced pictures first
+_LARGE_PX, _MIDDLE_PX = 1750, 900  # beyond these a chessboard is searched in reduced pictures first
 _REDUCED_PX = (700, 1400)
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
@@ -268,6 +268,8 @@ def _chessboard(grey: Grey, board: Board) -> Array | None:
     ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
     if width > _LARGE_PX:
         ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
+    elif width > _MIDDLE_PX:
+        ways = [(_REDUCED_PX[0] / width, plain), *ways]
     if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:
         return None
     there = rough.reshape(board.rows, board.columns, 2)
