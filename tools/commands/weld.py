@@ -190,15 +190,6 @@ def weld(
     return Outcome(found.summary(), first=found.first)
 
 
-def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Run all parts of a scenario's job.
-
-    Raises:
-        InputError, UnreachableScanner: the scenario or the options cannot be run; nothing has been written.
-    """
-    return run_scenario(load_scenario(options.scenario), options, progress)
-
-
 def run_calibration_live(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
     """Run only the calibration of a scenario: calibrate, verify, park."""
     scenario = load_scenario(options.scenario)

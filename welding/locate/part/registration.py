@@ -100,23 +100,8 @@ def register_part(
     """
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
-    return register_prepared(
-        scan, PartModel(mesh, config.seed), X_BP_guess, X_BP_hint=X_BP_hint, matters_P=matters_P, config=config
-    )
-
-
-def register_prepared(
-    scan: PreparedScan,
-    model: PartModel,
-    X_BP_guess: RigidTransform | None = None,
-    *,
-    X_BP_hint: RigidTransform | None = None,
-    matters_P: Floats | None = None,
-    config: PartConfig | None = None,
-) -> PartRegistration:
-    """Register a prepared part to a prepared scan; see register_part."""
-    found = candidates(scan, model, X_BP_guess, X_BP_hint, config or PartConfig())
-    return decided(found, scan, model, matters_P)
+    model = PartModel(mesh, config.seed)
+    return decided(candidates(scan, model, X_BP_guess, X_BP_hint, config), scan, model, matters_P)
 
 
 @dataclass(frozen=True, eq=False)
