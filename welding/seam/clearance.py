@@ -172,7 +172,7 @@ def check_beside(
 def _boxed(points: NDArray[np.float64], about: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
     """Return the points (N,3) m that are not farther than `reach_m` from the box about others (M,3)."""
     low, high = about.min(axis=0) - reach_m, about.max(axis=0) + reach_m
-    return points[((points >= low) & (points <= high)).all(axis=1)]
+    return np.asarray(points[((points >= low) & (points <= high)).all(axis=1)])
 
 
 def clear_pieces(
