@@ -105,11 +105,11 @@ def locate_part(
     from weldcal.welding.locate.part.registration import decided
     from weldcal.welding.locate.part.result import PartConfig
 
-    points = finite_points(points_B)
+    clouds = finite_points(points_B)
     eyes = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
     places = [None if X is None else X.GetAsMatrix4() for X in (X_BP_guess, X_BP_hint)]
-    key = b"|".join(b"" if a is None else a.tobytes() for a in (*points, mesh.vertices, mesh.triangles, eyes, *places))
-    asked = points, mesh, eyes, X_BP_guess, X_BP_hint, config or PartConfig()
+    key = b"|".join(b"" if a is None else a.tobytes() for a in (*clouds, mesh.vertices, mesh.triangles, eyes, *places))
+    asked = clouds, mesh, eyes, X_BP_guess, X_BP_hint, config or PartConfig()
     scan, model, candidates = _shown(_Asked(sha256(key).digest() + repr(asked[-1]).encode(), asked))
     if isinstance(candidates, WeldcalError):
         raise candidates.with_traceback(None)

@@ -68,7 +68,6 @@ class SchemaKey:
         return isinstance(self.kind, UnionType) and NoneType in get_args(self.kind)
 
 
-@cache
 def keys_of(config: type) -> tuple[SchemaKey, ...]:
     """Return the keys of a dataclass, those of its base classes included, in their order."""
     comments: dict[str, str] = {}
@@ -82,6 +81,7 @@ def keys_of(config: type) -> tuple[SchemaKey, ...]:
     )
 
 
+@cache
 def _comments(config: type) -> dict[str, str]:
     """Comments of the fields that a class itself defines; empty for a class made at run time, which has no source."""
     try:
