@@ -265,11 +265,10 @@ def _right_handed(points: Array, columns: int, rows: int) -> bool:
 def _chessboard(grey: Grey, board: Board) -> Array | None:
     size = (board.columns, board.rows)
     width, plain = max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
-    ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
+    ways = [(_REDUCED_PX[0] / width, plain)] * (width > _MIDDLE_PX)
+    ways += [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
     if width > _LARGE_PX:
         ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
-    elif width > _MIDDLE_PX:
-        ways = [(_REDUCED_PX[0] / width, plain), *ways]
     if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:
         return None
     there = rough.reshape(board.rows, board.columns, 2)
