@@ -61,7 +61,7 @@ def _imported() -> Any:
 
 
 class _Open3D:
-    """Import Open3D when one of its names is used for the first time: it takes 0.4 s."""
+    """Import Open3D when a name of it is used for the first time: it takes 0.4 s."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(_imported(), name)

@@ -146,7 +146,7 @@ class _Bodies(list[Solid]):
         return [self[k] for k in np.flatnonzero((self.boxes[0] <= high).all(1) & (self.boxes[1] >= low).all(1))]
 
     def hold(self, *places: Floats) -> bool:
-        """Return whether one of them holds one of the places."""
+        """Return whether any body holds any of the places."""
         return any(body.holds(p) for p in places for body in self.near(p, p))
 
 

@@ -1,4 +1,4 @@
-"""weldcal robots: the known robots, with the sources of their numbers."""
+"""weldcal robots: list the supported robots, with the sources of their numbers."""
 
 import math
 from collections.abc import Mapping

@@ -263,10 +263,9 @@ def _right_handed(points: Array, columns: int, rows: int) -> bool:
 
 
 def _chessboard(grey: Grey, board: Board) -> Array | None:
-    size = (board.columns, board.rows)
-    width, plain = max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
-    ways = [(_REDUCED_PX[0] / width, plain)] * (width > _MIDDLE_PX)
-    ways += [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
+    size, width, plain = (board.columns, board.rows), max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
+    smaller = [(_REDUCED_PX[0] / width, plain)] * (width > _MIDDLE_PX)
+    ways = [*smaller, (1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
     if width > _LARGE_PX:
         ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
     if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:
