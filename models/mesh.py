@@ -49,6 +49,7 @@ class _Stub(ModuleType):
         return _Later(self.__name__, name)
 
 
+@lru_cache(1)
 def _imported() -> Any:
     stubs = {name: _Stub(name) for name in _PLOTTING if name not in sys.modules}
     sys.modules.update(stubs)
@@ -59,7 +60,14 @@ def _imported() -> Any:
             del sys.modules[name]
 
 
-o3d = _imported()
+class _Open3D:
+    """Import Open3D when a name of it is used for the first time: it takes 0.4 s."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_imported(), name)
+
+
+o3d: Any = _Open3D()
 
 
 # pydrake.geometry and scipy.spatial are imported where they are used: they take half of the time in which a process

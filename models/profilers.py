@@ -57,21 +57,6 @@ def make_scene(mesh: TriMesh) -> Any:
     return scene
 
 
-def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: ProfilerPreset) -> Floats:
-    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m.
-
-    NaN: nothing in range.
-    """
-    from weldcal.models.mesh import o3d  # slow to import
-
-    x = preset.x_m
-    start = translation[:, None] + x[None, :, None] * rotation[:, None, :, 0]
-    rays = np.concatenate([start, np.broadcast_to(rotation[:, None, :, 2], start.shape)], axis=2)
-    hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy().astype(float)
-    hit[~((hit >= preset.near_m) & (hit <= preset.far_m))] = np.nan
-    return np.stack([np.broadcast_to(x, hit.shape), hit], axis=2)
-
-
 def with_noise(profiles: Floats, preset: ProfilerPreset, rng: np.random.Generator) -> Floats:
     """Return the same profiles (..., 2) as a real sensor returns them."""
     p = np.array(profiles, float)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from pydrake.math import RigidTransform
 
@@ -87,7 +88,7 @@ class Robot:
         """Which joint angles `inverse_kinematics` finds."""
         return "all" if self.joints == len(LINKS) else "some"
 
-    @property
+    @cached_property
     def chain(self) -> Chain:
         """Kinematics and limits."""
         return load_chain(self.name)

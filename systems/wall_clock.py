@@ -94,11 +94,6 @@ class Lateness:
         """How many were this late (one of LIMITS_MS) or later."""
         return sum(self.counts[LIMITS_MS.index(limit_ms) + 1 :])
 
-    def shared_with(self, other: "Lateness", limit_ms: float) -> int:
-        """How many that were `limit_ms` late or later were waited for while one of `other` was waited for."""
-        longest = [(begin, end) for begin, end in self.delays if 1e3 * (end - begin) >= limit_ms - 1e-6]
-        return sum(any(begin < there and here < end for here, there in other.delays) for begin, end in longest)
-
     def summary(self) -> dict[str, object]:
         """The JSON object: limits and counts of the bins (one more than limits), the share on time, and the worst."""
         return {

@@ -16,6 +16,7 @@ import pytest
 from tests.browser import RUNNING, browser
 from tests.compiling import compile_one_by_one
 from tests.places import SHARED_DATA, require_data
+from tests.quick import quick_files
 from tests.scheduling import Scheduling, order, processes
 from tests.short_job import finished_demo, short_jobs
 
@@ -28,8 +29,9 @@ gc.disable()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The mark `needs` of tests.places."""
+    """The marks `needs_data` of tests.places and `quick`."""
     config.addinivalue_line("markers", "needs_data(path): skipped where the measured data are absent, and failed in CI")
+    config.addinivalue_line("markers", "quick: of a file that takes two seconds or less (tests/quick.py)")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -68,8 +70,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files are dealt to the processes one by one, in this order."""
+    """Files are dealt to the processes one by one, in this order; quick ones have their mark."""
     items.sort(key=order)
+    quick = quick_files()
+    for item in items:
+        if item.nodeid.partition("::")[0] in quick:
+            item.add_marker("quick")
 
 
 def pytest_collection_finish() -> None:

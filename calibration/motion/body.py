@@ -39,8 +39,6 @@ _LEAST_HELD = 2e-4  # mean square of what the surface moves along its normals, o
 _WORST_RMS_M = 1.5e-3  # 2.5 mm / sqrt(3): what pairs of the last stage (_STAGES) leave on any surface
 _CORRELATED = 4.0  # pixels that share their noise
 
-pairs = o3d.pipelines.registration
-
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
@@ -167,6 +165,7 @@ class BodyTracker:
         X_LC = guess.inverse().GetAsMatrix4()
         first = 0
         for reach, steps in _STAGES[0 if coarse else 1 :]:
+            pairs = o3d.pipelines.registration
             kernel = pairs.TukeyLoss(k=reach)
             found = pairs.registration_icp(
                 source,

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arms.kinematics import POSE_KEYS, Chain, known_arms, load_arm, pose_matrix
-from weldcal.models.documents import did_you_mean
+from weldcal.models.documents import did_you_mean, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
@@ -55,7 +54,7 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
     if name not in known_chains():
         listed = f"choose one of: {', '.join(known_chains())}."
         raise InputError(f"There is no arm {name!r}; {did_you_mean(name, known_chains(), listed)}")
-    data: dict[str, Any] = yaml_load_file(str(path))
+    data: dict[str, Any] = read_document(path)
     joints = data["joints"]
     lower, upper, velocity = (np.array([float(j[key]) for j in joints]) for key in ("lower", "upper", "velocity"))
     return Chain(
@@ -71,7 +70,7 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
 
 def chain_capsules(name: str) -> list[list[float]]:
     """Return the capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
-    return [[float(v) for v in row] for row in yaml_load_file(str(_HERE / name / "chain.yaml"))["capsules"]]
+    return [[float(v) for v in row] for row in read_document(_HERE / name / "chain.yaml")["capsules"]]
 
 
 def read_urdf_chain(path: Path) -> Chain:

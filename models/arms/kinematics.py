@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -145,17 +145,14 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
     return with_link_transforms(nominal, *_read_kinematics(Path(kinematics)), Path(kinematics).name, advice)
 
 
-@lru_cache(maxsize=8)
+@cache
 def _nominal(name: str) -> ArmModel:
     """Return an arm that is known, read once: a run asks for it a hundred times."""
     folder = _HERE / name
     stack, _ = _read_kinematics(folder / "default_kinematics.yaml")
-    limits = _read(folder / "joint_limits.yaml", "joint_limits")
-    physical = folder / "physical_parameters.yaml"
-    inertia = _read(physical, "inertia_parameters")
-    dh = _read(physical, "dh_parameters")
-    offsets = _read(physical, "offsets")
-    radii = _read(physical, "housing_radii")
+    (limits,) = _read(folder / "joint_limits.yaml", "joint_limits")
+    sections = ("inertia_parameters", "dh_parameters", "offsets", "housing_radii")
+    inertia, dh, offsets, radii = _read(folder / "physical_parameters.yaml", *sections)
 
     def limit(key: str) -> Array:
         return _frozen([_number(limits, joint, key) for joint in JOINT_NAMES])
@@ -301,7 +298,7 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
 
 def _read_kinematics(path: Path) -> tuple[Array, str]:
     """Link transforms (6, 4, 4) and the calibration hash of a kinematics file."""
-    section = dict(_read(path, "kinematics"))
+    section: dict[str, Any] = dict(*_read(path, "kinematics"))
     fingerprint = str(section.pop("hash", ""))
     for found, wanted, where in [(section, LINKS, "kinematics")] + [
         (section.get(link), POSE_KEYS, f"kinematics.{link}") for link in LINKS
@@ -320,16 +317,17 @@ def pose_matrix(row: Sequence[float]) -> Array:
     return X
 
 
-def _read(path: Path, section: str) -> Mapping[str, Any]:
-    """Return the mapping under the top-level key `section` of a YAML file."""
+def _read(path: Path, *sections: str) -> list[Mapping[str, Any]]:
+    """Return the mappings under top-level keys of a YAML file."""
     if not path.exists():
         raise InputError(f"{path} cannot be read (it does not exist); name an existing YAML file.")
     data = read_document(path)
-    if not isinstance(data, Mapping) or not isinstance(data.get(section), Mapping):
-        raise InputError(
-            f"{path.name} has no section {section!r}; write it as Universal Robots' ROS 2 description does."
-        )
-    return dict(data[section])
+    for section in sections:
+        if not isinstance(data, Mapping) or not isinstance(data.get(section), Mapping):
+            raise InputError(
+                f"{path.name} has no section {section!r}; write it as Universal Robots' ROS 2 description does."
+            )
+    return [dict(data[section]) for section in sections]
 
 
 def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) -> float:

@@ -23,7 +23,7 @@ from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopToo
 from OCP.collections import IndexedMap_TopoDS_Shape_TopTools_ShapeMapHasher as Shapes
 from OCP.ElCLib import ElCLib
 from OCP.GC import GC_MakeCircle
-from OCP.Geom import Geom_CylindricalSurface, Geom_Plane
+from OCP.Geom import Geom_CylindricalSurface, Geom_Line, Geom_Plane
 from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
 from OCP.GeomAdaptor import GeomAdaptor_Surface
 from OCP.GeomAPI import GeomAPI_Interpolate
@@ -370,6 +370,10 @@ def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, flo
 
 def sampled(curve: Any, begin: float, end: float) -> Floats:
     """Points (N,3) on a stretch of a curve, 0.5 mm apart on a bent one."""
+    if isinstance(curve, Geom_Line) or (
+        isinstance(curve, BRepAdaptor_Curve) and curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
+    ):
+        return np.array([array_of(curve.Value(begin)), array_of(curve.Value(end))])
     steps = np.linspace(begin, end, 33)
     points = np.array([array_of(curve.Value(u)) for u in steps])
     length = length_of(points)

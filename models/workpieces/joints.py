@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -98,7 +99,7 @@ def joints_between(bodies: Sequence[Solid], notes: list[str], names: Sequence[st
     Raises:
         InputError: none is found by then.
     """
-    begin = time.process_time()
+    begin, bodies = time.process_time(), _Bodies(bodies)
     by_pair, failed = dict[tuple[int, ...], list[list[Piece]]](), list[str]()
 
     def search(pairs: Sequence[tuple[int, ...]], pieces: Callable[[tuple[int, ...]], Iterable[Piece]]) -> None:
@@ -132,7 +133,24 @@ def joints_between(bodies: Sequence[Solid], notes: list[str], names: Sequence[st
     return [_named(chain, found) for chain in found]
 
 
-def _pair(bodies: Sequence[Solid], pair: tuple[int, ...], begin: float) -> Iterable[Piece]:
+class _Bodies(list[Solid]):
+    """The bodies of a part with an index of their boxes: near a place there are few of many."""
+
+    @cached_property
+    def boxes(self) -> Floats:
+        """Their corners (2,N,3), mm."""
+        return np.array([[body.low for body in self], [body.high for body in self]])
+
+    def near(self, low: Floats, high: Floats) -> list[Solid]:
+        """Return those whose box meets the box between two corners, in the file's order."""
+        return [self[k] for k in np.flatnonzero((self.boxes[0] <= high).all(1) & (self.boxes[1] >= low).all(1))]
+
+    def hold(self, *places: Floats) -> bool:
+        """Return whether any body holds any of the places."""
+        return any(body.holds(p) for p in places for body in self.near(p, p))
+
+
+def _pair(bodies: _Bodies, pair: tuple[int, ...], begin: float) -> Iterable[Piece]:
     """Return the pieces between two bodies."""
     i, j = pair
     a, b = bodies[i], bodies[j]
@@ -155,7 +173,7 @@ def _check_time(begin: float) -> None:
         raise _TimeUpError
 
 
-def _within(bodies: Sequence[Solid], k: int, begin: float) -> Iterable[Piece]:
+def _within(bodies: _Bodies, k: int, begin: float) -> Iterable[Piece]:
     """Return the pieces along the concave edges of one body."""
     for edge, met in bodies[k].edges:
         if len(met) != 2:
@@ -194,7 +212,7 @@ def _far(a: SolidFace | Solid, b: SolidFace | Solid) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
-def _met(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
+def _met(bodies: _Bodies, pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
     """Return the pieces along which two faces meet in a concave joint."""
     if f.surface is None or g.surface is None:
         return
@@ -227,7 +245,7 @@ def _met(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidF
 
 
 def _between(
-    bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace, curve: Any, begin: float, end: float
+    bodies: _Bodies, pair: tuple[int, int], f: SolidFace, g: SolidFace, curve: Any, begin: float, end: float
 ) -> dict[str, Any] | None:
     """Return the joint of two faces along a stretch of their curve; None where they form none.
 
@@ -242,7 +260,7 @@ def _between(
 
 
 def _breaks(
-    bodies: Sequence[Solid], curve: Any, low: Floats, high: Floats, own: tuple[SolidFace, SolidFace]
+    bodies: _Bodies, curve: Any, low: Floats, high: Floats, own: tuple[SolidFace, SolidFace]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -254,8 +272,8 @@ def _breaks(
         at = (corners - array_of(origin)) @ array_of(along)
         begin, end = float(at.min()), float(at.max())
     found = [begin, end]
-    for body in bodies:
-        for face in () if (body.low > high).any() or (body.high < low).any() else body.faces:
+    for body in bodies.near(low, high):
+        for face in body.faces:
             if face in own or face.surface is None or (face.low > high).any() or (face.high < low).any():
                 continue
             try:
@@ -286,7 +304,7 @@ def _breaks(
 
 
 def _cut(
-    bodies: Sequence[Solid],
+    bodies: _Bodies,
     pair: tuple[int, int],
     f: SolidFace,
     g: SolidFace,
@@ -320,7 +338,7 @@ def _cut(
     if gap > GAP_MM:
         return None
     up = unit(normals[0] + normals[1])
-    if any(body.holds(x + s * up) for body in bodies for s in (IN_MM, FREE_MM)):
+    if bodies.hold(x + IN_MM * up, x + FREE_MM * up):
         return None
     two = bodies[pair[0]], bodies[pair[1]]
     angle = math.pi - math.acos(cos)
@@ -377,7 +395,7 @@ def _of_pipe(f: SolidFace, g: SolidFace, t: Floats, two: tuple[Solid, Solid]) ->
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
+def _flush(bodies: _Bodies, pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
@@ -398,7 +416,7 @@ def _flush(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: Soli
             if line is None or length_of(line) < LEAST_MM:
                 continue
             x = 0.5 * (line[0] + line[-1]) if f.flat else p + 0.5 * gap * m
-            if any(body.holds(x + s * n) for body in bodies for s in (IN_MM, FREE_MM)):
+            if bodies.hold(x + IN_MM * n, x + FREE_MM * n):
                 continue
             starts = [x - (0.5 * gap + IN_MM) * m, x + (0.5 * gap + IN_MM) * m]
             depth = [IN_MM + two[k].through(starts[k] - IN_MM * n, -n)[0] for k in (0, 1)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -63,12 +64,7 @@ def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
         closed = len(line) > 3 and bool(np.linalg.norm(line[0] - line[-1]) < 1e-6)
         drawn = draw_seam(shape.mesh, line, joint, normals, closed)
     else:
-        line, closed = chained(shape, source.edges)
-        ups = [shape.edge(id).up_P for id in source.edges if len(shape.edge(id).points_P) == 2]
-        normals = (
-            np.broadcast_to(ups[0], line.shape) if len(ups) == len(source.edges) == 1 and ups[0] is not None else None
-        )
-        drawn = draw_seam(shape.mesh, line, joint, normals, closed)
+        drawn = _along_edges(shape, tuple(source.edges), joint)
     if source.direction == "reverse":
         drawn = drawn.reversed()
     if source.end_m < 0.0 and not (drawn.closed and source.end_m >= -drawn.length_m):
@@ -79,6 +75,14 @@ def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
     if source.start_m or source.end_m:
         drawn = drawn.between(source.start_m, drawn.length_m - source.end_m)
     return drawn
+
+
+@lru_cache(64)  # a check, a cell and a plan ask for the same seam
+def _along_edges(shape: PartShape, edges: tuple[int, ...], joint: str) -> DrawnSeam:
+    line, closed = chained(shape, edges)
+    ups = [shape.edge(id).up_P for id in edges if len(shape.edge(id).points_P) == 2]
+    normals = np.broadcast_to(ups[0], line.shape) if len(ups) == len(edges) == 1 and ups[0] is not None else None
+    return draw_seam(shape.mesh, line, joint, normals, closed)
 
 
 def chained(shape: PartShape, ids: Sequence[int]) -> tuple[Floats, bool]:

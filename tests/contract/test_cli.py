@@ -25,7 +25,7 @@ from weldcal.tools.cli.app import PANELS, app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
-HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
+HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numba", "numpy")
 
 
 def weldcal(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -99,15 +99,24 @@ def test_a_shell_completes_names_without_a_heavy_import() -> None:
     assert done.stdout.split() == ["capture", "calibrate", "camera", "check-robot", "check-cell"]
 
 
-def test_help_loads_no_heavy_library() -> None:
+def test_help_and_a_mistyped_path_load_no_heavy_library() -> None:
+    reading = [name for name, made in LEAVES.items() if made.params[0].param_type_name == "argument"]
+    calls = [["--help"], *([*name.split()[1:], "--help"] for name in LEAVES)]
+    missing = ["calibrate", "doctor", "fleet", "hand-eye ax-yb", "part", "profiler edge", "verify", "view"]
+    assert {f"weldcal {name}" for name in missing} <= set(reading)
+    calls += [[*name.split(), "no_such"] for name in missing]
     script = (
-        "import sys\nfrom weldcal.tools.cli import app as cli\nsys.argv = ['weldcal', '--help']\n"
-        f"try:\n    cli.main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
-        f"loaded = [name for name in {HEAVY!r} if name in sys.modules]\nassert not loaded, loaded\n"
+        "import sys\nfrom weldcal.tools.cli import app as cli\n"
+        f"for words in {calls!r}:\n"
+        "    sys.argv = ['weldcal', *words]\n"
+        "    try:\n        cli.main()\n"
+        "    except SystemExit as end:\n        assert end.code == (words[-1] != '--help'), (words, end.code)\n"
+        f"    loaded = [name for name in {HEAVY!r} if name in sys.modules]\n    assert not loaded, (words, loaded)\n"
     )
     finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
     assert finished.returncode == 0, finished.stderr
     assert "calibrate" in finished.stdout
+    assert finished.stderr.count("There is no file or folder 'no_such'") == len(missing)
 
 
 @pytest.mark.parametrize(
@@ -256,6 +265,7 @@ def test_a_slip_of_the_keyboard_gets_the_nearest_name(
     arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("poses.csv").touch()
     finished = CliRunner().invoke(app, arguments)
     assert finished.exit_code == 1
     assert words in finished.stderr

@@ -10,6 +10,7 @@ import typer
 import tests.figures
 from tests.figures.harness import FIGURES, Body, Run
 from tests.figures.mutate import mutate
+from tests.figures.speed import speed
 from weldcal.models.errors import WeldcalError
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -41,6 +42,7 @@ for module in walk_packages(tests.figures.__path__, "tests.figures."):
 for name in sorted(FIGURES):
     app.command(name, short_help=FIGURES[name][0], help=FIGURES[name][0])(command(FIGURES[name][1]))
 app.command("mutate", short_help="whether the tests notice a changed formula")(mutate)
+app.command("speed", short_help="processor time of what people wait for, against a commit")(speed)
 
 if __name__ == "__main__":
     app(prog_name="./tools/run figures")

@@ -33,7 +33,7 @@ from weldcal.systems.drivers.ur.wire.line import ask, stop_program
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.robots import emit_table
+from weldcal.tools.commands.controllers import emit_table
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import PORTS, free_address
 

@@ -20,7 +20,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.cell.check import CellReport, edge_width_px, look_at_cell
-from weldcal.tools.commands.robots import state_of
+from weldcal.tools.commands.controllers import state_of
 
 FACING = RigidTransform(RollPitchYaw(np.pi, 0.1, 0.3), [0.02, 0.01, 0.6])  # a flange before the scanner
 

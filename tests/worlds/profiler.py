@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,8 @@ from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh
-from weldcal.models.profilers import ProfilerPreset, cast_profiles, make_scene
+from weldcal.models.mesh import TriMesh, o3d
+from weldcal.models.profilers import ProfilerPreset, make_scene
 
 RADIUS_M = 0.020
 SAMPLES = 120
@@ -509,3 +510,16 @@ def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
 
 def _poses(T: Floats) -> FlangePoses:
     return FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM)
+
+
+def cast_profiles(scene: Any, rotation: np.ndarray, translation: np.ndarray, preset: ProfilerPreset) -> np.ndarray:
+    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m.
+
+    NaN: nothing in range.
+    """
+    x = preset.x_m
+    start = translation[:, None] + x[None, :, None] * rotation[:, None, :, 0]
+    rays = np.concatenate([start, np.broadcast_to(rotation[:, None, :, 2], start.shape)], axis=2)
+    hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy().astype(float)
+    hit[~((hit >= preset.near_m) & (hit <= preset.far_m))] = np.nan
+    return np.stack([np.broadcast_to(x, hit.shape), hit], axis=2)

@@ -78,7 +78,7 @@ class LazyCommands(MutableMapping[str, Any]):
 
 
 def _typer_command(name: str, entry: Entry) -> Any:
-    found = entry.load()
+    found = entry.head()
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     kind = type("KeyedCommand", (KeyedCommand,), {"keys": found.keys})
     alone.command(name, cls=kind, short_help=entry.short_help)(found.function)

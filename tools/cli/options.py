@@ -211,11 +211,15 @@ class Call:
 
 @dataclass(frozen=True)
 class CliCommand:
-    """A command: its full name ("tool check"), the function as Typer takes it, and the keys of its option --as."""
+    """A command: its full name ("tool check"), the function as Typer takes it, and the keys of its option --as.
+
+    ``read`` refuses wrong numbers and words of --as, and returns what --as states, by key.
+    """
 
     title: str
     function: Callable[..., None]
-    keys: tuple[str, ...] = ()
+    keys: tuple[str, ...]
+    read: Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 LARGEST_OPTION = 1e6
@@ -298,12 +302,16 @@ def command(
     preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
 
     def decorate(body: Body) -> CliCommand:
-        def run(**given: Any) -> None:
+        def read(given: Mapping[str, Any]) -> dict[str, Any]:
             _check_numbers(given)
+            return _read_keys(given.get("as_", ()), keys)
+
+        def run(**given: Any) -> None:
             # A signal in Python's logging below Drake's would be lost: C++ takes the exception. Set after the import,
             # the level holds in C++ (pydrake.common, _sync_spdlog_level), and Drake's notes never come to Python.
             logging.getLogger("drake").setLevel(logging.WARNING)
-            shared = {"as_": _read_keys(given.pop("as_", ()), keys)} | {name: given.pop(name) for name in names}
+            shared = {"as_": read(given)} | {name: given.pop(name) for name in names}
+            given.pop("as_", None)
             json, debug = shared.get("json", False), shared["debug"]
             with ExitStack() as pages:
                 with console.boundary(json_wanted=json, debug=debug), work(), ExitStack() as stack:
@@ -327,7 +335,7 @@ def command(
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
         run.__doc__ = body.__doc__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        return CliCommand(title, run, keys)
+        return CliCommand(title, run, keys, read)
 
     return decorate
 

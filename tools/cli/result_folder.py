@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from weldcal.models.errors import InputError
 from weldcal.models.files import UNFINISHED
@@ -12,6 +13,10 @@ from weldcal.models.files import UNFINISHED
 RUNNING = ".weldcal-running"
 """The file that a folder holds while a command writes there, with the number of its process."""
 JOURNAL = "tasks.jsonl"
+MEASURED_TOOL = "tool_measurement.json"
+RECORDING: Final = "recording.mcap"
+SCANS: Final = "scans"
+SUMMARY: Final = "summary.json"
 RESULTS = (
     "report.html", "calibration.yaml", "monitor.json", "verification.json", "run.json", "runs.csv", "summary.txt",
     "board.pdf", "tool.html", "finger.yaml", "edges.csv", "findings.json", "best.script", "poses.script", "touches.csv",

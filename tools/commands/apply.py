@@ -28,6 +28,7 @@ def apply(
             metavar="[FILE]",
             help=f"File to write ({', '.join(FORMS)}); without it CLOUD_corrected.ply, here.",
             show_default=False,
+            writable=True,
         ),
     ] = None,
     *,

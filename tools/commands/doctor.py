@@ -1,14 +1,15 @@
 """Name what disturbs a calibration or a weld, with evidence and next step: `weldcal doctor`."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
@@ -21,16 +22,16 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.errors import InputError
 from weldcal.models.files import require_whole
 from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
-from weldcal.systems.cell import Cell
-from weldcal.systems.jobs.weld.settings import feature_standard
-from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, FlangeOption, Outcome, command
-from weldcal.tools.commands.cell.tool import MEASURED_TOOL
-from weldcal.tools.commands.replay import replay_recording
-from weldcal.tools.commands.run import RECORDING
-from weldcal.tools.commands.weld import SCANS, SUMMARY
+from weldcal.tools.cli.result_folder import MEASURED_TOOL, RECORDING, SCANS, SUMMARY
+from weldcal.tools.console import Progress
 from weldcal.tools.report.doctor import CALIBRATION, DoctorReport, worded
 from weldcal.welding.record.weld_log import CSV_NAME, PICTURE_S, WeldRecord, blind_s, gain_off, load_weld_log
+
+if TYPE_CHECKING:
+    from pydrake.systems.framework import Context
+
+    from weldcal.systems.cell import Cell
 
 _LOOKED_AT = 3  # scans in which other flanges are tried
 _SEEN = 0.8  # of the edge
@@ -52,7 +53,9 @@ def doctor(
     return Outcome(report.summary(), text=report.text())
 
 
-def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: Progress = no_progress) -> DoctorReport:
+def examine(
+    path: Path, *, flange: str | None = None, seed: int = 0, progress: Progress = lambda *_: None
+) -> DoctorReport:
     """Name the causes in a result folder (or calibration.yaml), a recording.mcap or a dataset; write nothing.
 
     Raises:
@@ -93,7 +96,7 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
     return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
 
 
-def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Progress = no_progress) -> Diagnosis:
+def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Progress = lambda *_: None) -> Diagnosis:
     """Fit the flange in every scan of a dataset and name what disturbs them.
 
     Raises:
@@ -153,7 +156,7 @@ def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
         {},
         cell.job.X_FR.GetAsMatrix4(),
         robot=cell.scenario.arm,
-        flange=feature_standard(cell.scenario).designation,
+        flange=cell.scenario.feature_standard().designation,
         refused=seen.refused,
         guess=c.mounting_guess.pose().GetAsMatrix4(),
         guess_radius=1e-3 * c.guess_radius_mm,
@@ -163,6 +166,8 @@ def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
 
 def _recorded(path: Path, progress: Progress) -> Diagnosis:
     """Replay a recording, and examine what its calibration saw and its weld felt."""
+    from weldcal.tools.commands.replay import replay_recording  # only here: it loads a whole cell
+
     cases: list[DoctorCase] = []
     reasons: list[str] = []
 

@@ -26,7 +26,8 @@ from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools import console
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option, switch
-from weldcal.tools.commands.run import RECORDING, one_thread
+from weldcal.tools.cli.result_folder import RECORDING
+from weldcal.tools.commands.run import one_thread
 from weldcal.tools.commands.weld import killed_weld
 from weldcal.tools.report.first_screen import pose_rows
 from weldcal.tools.report.weld_record import RECORD_HTML

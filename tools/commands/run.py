@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -44,6 +44,7 @@ from weldcal.systems.viewer.live import LiveView
 from weldcal.systems.viewer.scene import set_the_scene
 from weldcal.tools import console
 from weldcal.tools.cli.options import LIVE, Call
+from weldcal.tools.cli.result_folder import RECORDING
 from weldcal.tools.connections import guard
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
@@ -61,7 +62,6 @@ SLOWEST_PACE = 0.05
 ALMOST = 0.8  # likeness to "emulated" from which on a word is a slip and not the name of a host
 _NO_CONTROLLER = "--dry-run and --pace need a controller: give --robot emulated or the address of a controller."
 GRAVITY = 9.82  # m/s^2, as a controller has it
-RECORDING: Final = "recording.mcap"
 _PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")
 
 RECORDED = (*LIVE, "record")

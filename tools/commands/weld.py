@@ -28,7 +28,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Replacement
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command, option
-from weldcal.tools.cli.result_folder import writer
+from weldcal.tools.cli.result_folder import SCANS, SUMMARY, writer
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options, save_scans
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.first_screen import typed
@@ -158,8 +158,6 @@ def keeper_of(scenario: Scenario, options: RunOptions, earlier: WeldProgress | N
     return ProgressKeeper(options.out, files, begun)
 
 
-SCANS: Final = "scans"
-SUMMARY: Final = "summary.json"
 FIT_UP_CSV: Final = "fit_up.csv"
 PRESET: Final = "straight_groove"
 
@@ -190,15 +188,6 @@ def weld(
         return Outcome(found.summary(), first=found.first)
     found = run_weld(run_options(call, "weld", named_once(name, scenario, PRESET)), call.progress)
     return Outcome(found.summary(), first=found.first)
-
-
-def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Run all parts of a scenario's job.
-
-    Raises:
-        InputError, UnreachableScanner: the scenario or the options cannot be run; nothing has been written.
-    """
-    return run_scenario(load_scenario(options.scenario), options, progress)
 
 
 def run_calibration_live(options: RunOptions, progress: Progress = no_progress) -> DemoResult:

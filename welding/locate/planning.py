@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +12,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart
@@ -24,7 +26,10 @@ from weldcal.welding.seam.curve import SeamCurve, ringed
 
 if TYPE_CHECKING:
     from weldcal.welding.locate.part.joint import MeasuredJoint
+    from weldcal.welding.locate.part.model import PartModel
+    from weldcal.welding.locate.part.registration import Candidates
     from weldcal.welding.locate.part.result import PartConfig, PartRegistration
+    from weldcal.welding.locate.part.scan import PreparedScan
 
 METHODS = ("cad", "cloud")
 SEARCHES = ("guess", "anywhere")
@@ -97,19 +102,46 @@ def locate_part(
     """
     # only here: a plate, or a cloud alone, needs none of it
     from weldcal.welding.locate.part.joint import measure_fit_up, measure_joint
-    from weldcal.welding.locate.part.model import PartModel
-    from weldcal.welding.locate.part.registration import register_prepared
+    from weldcal.welding.locate.part.registration import decided
     from weldcal.welding.locate.part.result import PartConfig
-    from weldcal.welding.locate.part.scan import prepare
 
-    config = config or PartConfig()
-    scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
-    model = PartModel(mesh, config.seed)
-    found = register_prepared(scan, model, X_BP_guess, X_BP_hint=X_BP_hint, matters_P=seam.points_P, config=config)
+    clouds = finite_points(points_B)
+    eyes = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
+    places = [None if X is None else X.GetAsMatrix4() for X in (X_BP_guess, X_BP_hint)]
+    key = b"|".join(b"" if a is None else a.tobytes() for a in (*clouds, mesh.vertices, mesh.triangles, eyes, *places))
+    asked = clouds, mesh, eyes, X_BP_guess, X_BP_hint, config or PartConfig()
+    scan, model, candidates = _shown(_Asked(sha256(key).digest() + repr(asked[-1]).encode(), asked))
+    if isinstance(candidates, WeldcalError):
+        raise candidates.with_traceback(None)
+    found = decided(candidates, scan, model, seam.points_P)
     near = [_about_seam(into(found.X_BP, v.measured), into(found.X_BP, v.eye[None])[0], seam) for v in scan.views]
     points, normals = (np.concatenate(part) for part in zip(*near, strict=True))
     shown = (points, normals, scan.pitch_m, model, seam)
     return found, replace(measure_joint(*shown), fit_up=measure_fit_up(*shown))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A part and scans of it; equal by their content."""
+
+    digest: bytes
+    asked: Any = field(compare=False)
+
+
+@lru_cache(1)
+def _shown(of: _Asked) -> "tuple[PreparedScan, PartModel, Candidates | WeldcalError]":
+    """Prepare a part and scans of it, and find where it may be: once for all seams of the part."""
+    from weldcal.welding.locate.part.model import PartModel
+    from weldcal.welding.locate.part.registration import candidates
+    from weldcal.welding.locate.part.scan import prepare
+
+    points, mesh, eyes, guess, hint, config = of.asked
+    scan = prepare(points, eyes, config.min_points, config.seed)
+    model = PartModel(mesh, config.seed)
+    try:
+        return scan, model, candidates(scan, model, guess, hint, config)
+    except WeldcalError as refused:
+        return scan, model, refused
 
 
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:

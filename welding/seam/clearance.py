@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -66,7 +67,7 @@ def check_clearance(
     Raises:
         NoClearance: less than 1 mm, with the place.
     """
-    points, _ = mesh.sample(SAMPLES, np.random.default_rng(0))
+    points = _sampled(mesh)
     points_B = points @ X_BP.rotation().matrix().T + X_BP.translation()
     spans = [span for capsule in capsules if (span := _above_tip(capsule, X_FT)) is not None]
     last = min(seam.drawn_m, seam.length + chord_m)
@@ -82,6 +83,12 @@ def check_clearance(
                     " finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
                 )
+
+
+@lru_cache(4)
+def _sampled(mesh: TriMesh) -> NDArray[np.float64]:
+    """Return points (N,3) m on a mesh: the same for every edge of a part."""
+    return mesh.sample(SAMPLES, np.random.default_rng(0))[0]
 
 
 def check_beside(
@@ -119,12 +126,14 @@ def check_beside(
     body = np.vstack([a + share * (b - a) for a, b, _ in spans])
     swept = cKDTree(np.vstack([tip.position + (body + lift * upward / NEAR_TIP_M) @ R.T for _, lift, tip, R in held]))
     reach = max(radius for _, _, radius in spans) + STEP_BESIDE_M
-    near = points_B[np.asarray(swept.query(points_B, distance_upper_bound=reach)[0]) < reach]
+    near = _boxed(points_B, np.asarray(swept.data), reach)
+    near = near[np.asarray(swept.query(near, distance_upper_bound=reach)[0]) < reach]
     if len(near) < 2:
         return
-    surface = cKDTree(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0])
+    samples = _boxed(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0], near, 2.0 * OTHER_M)
+    surface = cKDTree(samples, balanced_tree=False, compact_nodes=False)
     pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
-    other = near[np.asarray(surface.query(near)[0]) > OTHER_M]
+    other = near[np.asarray(surface.query(near, distance_upper_bound=2.0 * OTHER_M)[0]) > OTHER_M]
     flat = other[:, 2] < table_z_m + OTHER_M
     least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
     before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
@@ -158,6 +167,12 @@ def check_beside(
                 raise NoClearance(
                     f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M
                 )
+
+
+def _boxed(points: NDArray[np.float64], about: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
+    """Return the points (N,3) m that are not farther than `reach_m` from the box about others (M,3)."""
+    low, high = about.min(axis=0) - reach_m, about.max(axis=0) + reach_m
+    return np.asarray(points[((points >= low) & (points <= high)).all(axis=1)])
 
 
 def clear_pieces(

@@ -15,28 +15,9 @@ from weldcal.welding.servo.state import ServoSample, WeldingState
 
 BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH handled here
 
-_STRAIGHT_RAD = math.radians(10.0)  # a bend turns by more than this
-_BESIDE_M = 4.0e-3  # the tip must not touch down within this distance of a bend
-_REACH_M = 0.030  # nor farther than this from the start
 _SETTLED_M = 0.15e-3  # three times the tag's noise of 0.05 mm, small against the tip's radius
 _REENTRY_M = 12.0e-3  # a choice, two tip diameters and more: a groove that is not met by then does not begin here
 _LEAST_STEP_M = 0.03e-3  # a choice, below the tag's noise of 0.05 mm: nearer points give the curve no direction
-
-
-def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
-    """The settings with the touch position moved to the first straight stretch where the seam starts in a bend.
-
-    Next to a bend of about the touch's offset it is unknown which part of the seam the tip meets. Only a tip that
-    then measures the start backwards (`touch.feel_start`) may start so far along the seam.
-    """
-    touch = config.touch
-    if not touch.feel_start:
-        return config
-    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.gap.end_window_m), touch.arc_m + 1e-6), 1e-3)
-    turn = np.sum(plan.tangent(s - _BESIDE_M) * plan.tangent(s + _BESIDE_M), axis=1)
-    straight = np.flatnonzero(turn > math.cos(_STRAIGHT_RAD))
-    place = float(s[straight[0] if len(straight) else np.argmax(turn)])
-    return replace(config, touch=replace(touch, arc_m=place))
 
 
 def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:

@@ -33,7 +33,7 @@ EXAMPLES = {
     "tags": "tags:4x3:40:10:4X4_50 (4 x 3 tags of 40 mm, gaps of 10 mm)",
 }
 _LARGEST_MM, _MOST = 5000.0, 60
-_LARGE_PX = 1750  # beyond it a chessboard is searched in reduced pictures first
+_LARGE_PX, _MIDDLE_PX = 1750, 900  # beyond these a chessboard is searched in reduced pictures first
 _REDUCED_PX = (700, 1400)
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
@@ -259,9 +259,9 @@ def _right_handed(points: Array, columns: int, rows: int) -> bool:
 
 
 def _chessboard(grey: Grey, board: Board) -> Array | None:
-    size = (board.columns, board.rows)
-    width, plain = max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
-    ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
+    size, width, plain = (board.columns, board.rows), max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
+    smaller = [(_REDUCED_PX[0] / width, plain)] * (width > _MIDDLE_PX)
+    ways = [*smaller, (1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
     if width > _LARGE_PX:
         ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
     if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:

@@ -32,6 +32,7 @@ _BEHIND_M = 0.020  # twice the longest overlap: points that the torch may need a
 _SPACING_M = 0.2e-3  # a choice: as a picture every 25 ms at the usual 8 mm/s
 _FIRST = 8  # points: as many as the servo takes for what its plan is off
 _LONGEST_LAG_M = 2.0e-3  # a choice: the farthest that friction has held a tip back
+_NEAR_M = 5.0 * _LONGEST_LAG_M  # about its arc a felt point's place on the plan is looked for, not along the whole seam
 
 
 def sha256_of(files: Mapping[str, bytes]) -> str:
@@ -238,11 +239,12 @@ def felt_points(state: WeldingState) -> Array | None:
         if seam.arc[k] - seam.arc[spaced[-1]] >= _SPACING_M:
             spaced.append(k)
     points, arc = seam.points[spaced], seam.arc[spaced]
-    lag = np.clip(arc - curve.project(points), 0.0, _LONGEST_LAG_M)
+    near = curve.project(points, arc, _NEAR_M)
+    lag = np.clip(arc - near, 0.0, _LONGEST_LAG_M)
     rows = np.column_stack([points, lag])
     if keep[0] > 0:
         return rows
-    s = np.arange(max(state.s_torch - _BEHIND_M, 0.0), float(curve.project(points[0])) - _SPACING_M, _SPACING_M)
+    s = np.arange(max(state.s_torch - _BEHIND_M, 0.0), float(near[0]) - _SPACING_M, _SPACING_M)
     aside, above = mean_residual(seam.points[:_FIRST], curve, float(s[-1])) if len(s) else (0.0, 0.0)
     before = curve.position(s) + aside * curve.normal(s) + above * curve.up(s)
     return np.vstack([np.column_stack([before, np.full(len(s), lag[0])]), rows])

@@ -18,7 +18,8 @@ from weldcal.calibration.tool.comparison import EXCEEDED, HOLDS, judge_tool, mea
 from weldcal.calibration.tool.measure import ToolMeasurement, measure_tool
 from weldcal.calibration.tool.wire import WireTouch, find_wire
 from weldcal.models.tools.loading import WELDING, load_tool
-from weldcal.tools.commands.cell.tool import MEASURED_TOOL, MeasureReport
+from weldcal.tools.cli.result_folder import MEASURED_TOOL
+from weldcal.tools.commands.cell.tool import MeasureReport
 from weldcal.tools.commands.doctor import examine
 from weldcal.tools.report.render import write_json
 

@@ -10,7 +10,9 @@ from tests.worlds.weld.case import figures
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import run_cell
-from weldcal.tools.commands.weld import known_camera, measure, run_demo
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.commands.weld import known_camera, measure, run_scenario
+from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.report.run import RunOptions
 
@@ -57,6 +59,11 @@ ARM_FIGURES = ("X_BC_error_mm", "plan_max_mm", "torch_mean_mm", "torch_max_mm")
 
 def _of(rows: Iterable[Mapping[str, object]], name: str) -> list[float]:
     return [float(v) for row in rows if isinstance(v := row.get(name), int | float)]
+
+
+def run_demo(options: RunOptions) -> DemoResult:
+    """Run all parts of a scenario's job."""
+    return run_scenario(load_scenario(options.scenario), options)
 
 
 @figure("demo-seeds", "the demo over many seeds: mean and largest errors of calibration, plan and torch")

@@ -9,7 +9,8 @@ import pytest
 
 from tests.welding.weld_kinematics import l_curve, straight
 from tests.worlds.weld.seams import arcs, s_curve
-from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
+from tests.worlds.weld.speed import speed_statistics
+from weldcal.welding.record.process import ProcessLogError, path_error
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible

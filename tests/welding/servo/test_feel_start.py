@@ -11,10 +11,11 @@ from pydrake.math import RigidTransform
 from tests.worlds.weld.budgets import NOMINAL
 from tests.worlds.weld.plant import StudyRun, simulate
 from tests.worlds.weld.seams import TrueSeam, arcs
+from tests.worlds.weld.touch_place import with_touch_place
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
-from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place
+from weldcal.welding.servo.feel_start import feel_start_step
 from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
 from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchOnState, WeldingState
 

@@ -16,7 +16,8 @@ from tests.worlds.weld.budgets import HARD, NOMINAL, PERFECT
 from tests.worlds.weld.groove import DROP_M as DROP
 from tests.worlds.weld.groove import SEAT_M as SEAT
 from tests.worlds.weld.seams import s_curve
-from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
+from tests.worlds.weld.speed import SpeedStatistics, speed_statistics
+from weldcal.welding.record.process import PathError, path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import (
     ContactConfig,

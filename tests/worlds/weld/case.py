@@ -10,10 +10,11 @@ from tests.worlds.weld.budgets import BUDGETS, Budget
 from tests.worlds.weld.laws import steering
 from tests.worlds.weld.plant import PHASES, StudyRun, simulate
 from tests.worlds.weld.seams import get_seam
+from tests.worlds.weld.speed import speed_statistics
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.weld import FeltSeam, felt_seam
 from weldcal.welding.numerics import Array
-from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
+from weldcal.welding.record.process import ProcessLogError, path_error
 from weldcal.welding.record.welded_seam import evenness
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.feasibility import SeamWindows

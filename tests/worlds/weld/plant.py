@@ -13,10 +13,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from tests.worlds.weld.budgets import Budget, WeldUnknowns, draw_world, planned_seam, roughness
 from tests.worlds.weld.groove import DROP_M, SEAT_M, Groove, TipPlace
 from tests.worlds.weld.seams import TrueSeam
+from tests.worlds.weld.touch_place import with_touch_place
 from weldcal.models.tools.elastomers import Elastomer
 from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.feel_start import with_touch_place
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.step import welding_step

@@ -38,7 +38,7 @@ from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
-from weldcal.tools.commands.robots import emit_table, state_of
+from weldcal.tools.commands.controllers import emit_table, state_of
 from weldcal.welding.finger.deformation import TagModel, detect_tag
 
 LOOKED_AT = tuple(name for name in DEVICES if name not in ("robot", "robot_2"))

@@ -26,16 +26,19 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, ToolFile, WorkpieceConfig
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.scan_poses import (
-    TURNS_DEG,
-    OutOfTimeError,
-    add_scan_poses,
-    standing,
-    used_s,
-    weldable_places,
-)
+from weldcal.tools.commands.cell.scan_poses import TURNS_DEG, OutOfTimeError, add_scan_poses, standing, weldable_places
 from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
-from weldcal.tools.commands.cell.screen import Offer, joint_of, least_pipe, ranked, unfit, unit_hint, ways, without
+from weldcal.tools.commands.cell.screen import (
+    Offer,
+    joint_of,
+    least_pipe,
+    ranked,
+    unfit,
+    unit_hint,
+    used_s,
+    ways,
+    without,
+)
 from weldcal.tools.report.first_screen import typed
 
 BASE = "s_groove"
@@ -103,7 +106,7 @@ CANNOT_WELD = """# A cell of your own, unfinished: the arm cannot weld the seam 
 @command("new", common=("seed", "json", "debug"), short_help="Write a cell or a dataset of your own to start from.")
 def new(
     call: Call,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.", writable=True)],
     base: Annotated[str, option("--from", "NAME", "Scenario that the cell begins as, by name or path.")] = BASE,
     part: Annotated[
         Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")

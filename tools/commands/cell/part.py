@@ -1,5 +1,7 @@
 """weldcal part: which seams of a part can be welded, as a table, as JSON and as a page in 3D."""
 
+from __future__ import annotations
+
 import math
 import shlex
 from collections.abc import Callable, Sequence
@@ -14,10 +16,7 @@ import typer
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartEdge, PartShape
-from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import MOST_LINES, RESULT, Call, Outcome, command, option
-from weldcal.tools.commands.cell.new import OwnPart, planned
-from weldcal.tools.commands.cell.scan_poses import used_s
 from weldcal.tools.commands.cell.screen import (
     Offer,
     Seam,
@@ -28,8 +27,9 @@ from weldcal.tools.commands.cell.screen import (
     ranked,
     side_of,
     unit_hint,
+    used_s,
 )
-from weldcal.tools.console import emit_summary
+from weldcal.tools.console import Progress, emit_summary
 from weldcal.tools.report.first_screen import typed
 from weldcal.tools.report.render import csv_text, fixed, render, write_atomic
 
@@ -64,6 +64,7 @@ def part(
     shape = read_shape(file, units)
     call.progress("fit the tool", 0.2)
     seams = ranked(shape, load_tool(tool_file(tool)).tool)
+    call.progress(first_list(seams), 0.3)
     seams = with_plans(shape, seams, plan, file, units, tool_file(tool), call.progress, began_s)
     call.progress("draw", 0.9)
     folder = call.folder("part", file.name)
@@ -86,6 +87,16 @@ def part(
     return Outcome({**summary, "next": following}, text=shown)
 
 
+def first_list(seams: list[Seam]) -> str:
+    """Say which seams the tool fits, one line each, before the arm is asked."""
+    fit = [seam for seam in seams if not seam.reason]
+    lines = [
+        f"{edges_text(seam.joint.edges)}: {seam.as_row()['type']}, {1e3 * seam.joint.length_m:.1f} mm" for seam in fit
+    ]
+    more = [f"and {len(fit) - MOST_PLANNED} more"] * (len(fit) > MOST_PLANNED)
+    return "\n".join([f"the tool fits {len(fit)} of {len(seams)} seams", *lines[:MOST_PLANNED], *more])
+
+
 def with_plans(
     shape: PartShape,
     seams: list[Seam],
@@ -100,6 +111,8 @@ def with_plans(
     asked = seams[:most]
     if not asked:
         return seams
+    from weldcal.tools.commands.cell.new import OwnPart, planned  # only here: the list comes before these imports
+
     answers = planned(OwnPart(file, units=units), [seam.joint.edges for seam in asked], tool, progress, began_s)
     found = []
     for seam, (offers, refused) in zip(asked, answers, strict=False):

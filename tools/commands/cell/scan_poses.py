@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from weldcal.systems.messages import PlannedSeam, Scan, ScanView
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.systems.station import Station, make_station
+from weldcal.tools.commands.cell.screen import used_s
 from weldcal.welding.seam.clearance import NoClearance, check_beside
 
 MARGIN_M = 0.025  # least overlap of two scans, and what the outer ones show beyond the part's ends
@@ -202,11 +202,6 @@ def _refused(scenario: Scenario, station: Station, poses: list[Array]) -> str:
 
 class OutOfTimeError(Exception):
     """The time for planning is over."""
-
-
-def used_s() -> float:
-    """Return the processor time of this process and of those that have read a part for it, s."""
-    return sum(os.times()[:4])
 
 
 def _check_time(until_s: float, needs_s: float = 0.0) -> None:

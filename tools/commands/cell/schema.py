@@ -81,6 +81,7 @@ def keys_of(config: type) -> tuple[SchemaKey, ...]:
     )
 
 
+@cache
 def _comments(config: type) -> dict[str, str]:
     """Comments of the fields that a class itself defines; empty for a class made at run time, which has no source."""
     try:

@@ -1,11 +1,14 @@
 """Which joints of a part a tool fits, why not the others, and in which pieces a seam may be welded."""
 
+from __future__ import annotations
+
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -18,13 +21,15 @@ from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
 from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
-from weldcal.systems.scenario.parts import LEAST_LEG_M
-from weldcal.systems.scenario.schema import PoseConfig, SeamConfig
-from weldcal.tools.commands.cell.schema import yaml_of
 from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
+
+if TYPE_CHECKING:
+    from weldcal.systems.scenario.schema import PoseConfig, SeamConfig
+
+# What belongs to a cell is imported where it is used: the list of a part's seams needs none of it.
 
 PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
@@ -63,6 +68,8 @@ class Offer:
     @property
     def lines(self) -> str:
         """The lines of a scenario's workpiece that order it."""
+        from weldcal.tools.commands.cell.schema import yaml_of
+
         return f"  seams: {yaml_of(self.seams)}\n  joint: {self.joint}"
 
 
@@ -101,7 +108,11 @@ class Seam:
 
     def as_row(self) -> dict[str, Any]:
         """Return the seam for JSON: millimetres and degrees."""
-        j = self.joint
+        j, offers = self.joint, []
+        if self.offers:
+            from weldcal.tools.commands.cell.schema import yaml_of
+
+            offers = [{"edges": o.edges, "lines": o.lines, "pose_guess": yaml_of(o.pose)} for o in self.offers]
         return {
             "type": f"{j.type} {j.side}".strip(),
             "bodies": list(j.bodies),
@@ -117,10 +128,15 @@ class Seam:
             "reason": self.reason,
             "planned": self.planned,
             "pieces": " ".join(offer.note for offer in self.offers if offer.note),
-            "offers": [{"edges": o.edges, "lines": o.lines, "pose_guess": yaml_of(o.pose)} for o in self.offers],
+            "offers": offers,
             "refused": {str(id): why for id, why in self.refused.items()},
             "felt": self.felt,
         }
+
+
+def used_s() -> float:
+    """Return the processor time of this process and of those that have read a part for it, s."""
+    return sum(os.times()[:4])
 
 
 def side_of(edge: PartEdge) -> str:
@@ -275,6 +291,8 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
 
     Each with a note of the pieces, "" for the whole, and whether some of its seams may be left out.
     """
+    from weldcal.systems.scenario.schema import SeamConfig
+
     runs, named = followed(shape, ids), ", ".join(map(str, ids))
     found = [([SeamConfig(edges=run) for run in runs], "", False)]
     line, closed = chained(shape, runs[0])
@@ -313,6 +331,8 @@ def followed(shape: PartShape, ids: Sequence[int]) -> list[list[int]]:
 
 def unfit(edge: PartEdge) -> str:
     """Why an edge of a longer seam is not worth a plan, "" where it is."""
+    from weldcal.systems.scenario.parts import LEAST_LEG_M
+
     if edge.length_m <= LEAST_LEG_M:
         return f"shorter than the {1e3 * LEAST_LEG_M:.0f} mm that the tip needs."
     below = edge.up_P is not None and float(edge.up_P[2]) < -OPEN_ABOVE

@@ -34,6 +34,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, WeldingConfig
 from weldcal.tools.cli.options import LIVE, Call, LimitOption, Outcome, command, option
+from weldcal.tools.cli.result_folder import MEASURED_TOOL
 from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.touch import use_kinematics
 from weldcal.tools.console import emit_summary
@@ -43,8 +44,6 @@ from weldcal.tools.report.profiler_file import left_out
 from weldcal.tools.report.render import write_atomic, write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tool import TcpReport, ToolCheck, tool_picture, tool_report
-
-MEASURED_TOOL = "tool_measurement.json"
 
 TouchesOption = Annotated[
     Path | None, option("--touches", "FILE", "Flange poses at which the wire's end touched one point or a plate.")

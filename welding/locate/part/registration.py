@@ -100,24 +100,37 @@ def register_part(
     """
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
-    return register_prepared(
-        scan, PartModel(mesh, config.seed), X_BP_guess, X_BP_hint=X_BP_hint, matters_P=matters_P, config=config
-    )
+    model = PartModel(mesh, config.seed)
+    return decided(candidates(scan, model, X_BP_guess, X_BP_hint, config), scan, model, matters_P)
 
 
-def register_prepared(
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The best pose of a part in a scan and its rivals, whichever of its seams matters."""
+
+    best: _Judged
+    rivals: list[_Judged]
+    hint: RigidTransform | None
+    config: PartConfig
+
+
+def decided(found: Candidates, scan: PreparedScan, model: PartModel, matters_P: Floats | None) -> PartRegistration:
+    """Decide among the poses of a part for the points of one seam; see register_part."""
+    _check_known(found.best, model, matters_P, found.config)
+    best, runner_up, note = _decided(found.best, found.rivals, scan, model, found.hint, matters_P, found.config)
+    return _result(best, runner_up, note, model, matters_P)
+
+
+def candidates(
     scan: PreparedScan,
     model: PartModel,
-    X_BP_guess: RigidTransform | None = None,
-    *,
-    X_BP_hint: RigidTransform | None = None,
-    matters_P: Floats | None = None,
-    config: PartConfig | None = None,
-) -> PartRegistration:
-    """Register a prepared part to a prepared scan; see register_part."""
-    config = config or PartConfig()
-    _check_size(scan, model)
+    X_BP_guess: RigidTransform | None,
+    X_BP_hint: RigidTransform | None,
+    config: PartConfig,
+) -> Candidates:
+    """Find the best pose of a part in a scan, and its rivals; see register_part."""
     hint = X_BP_guess if X_BP_hint is None else X_BP_hint
+    _check_size(scan, model)
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
     fits = _fine(scan, model, starts, LARGE_PLACES if model.radius > LARGE_M else FINE_PLACES)
     if not fits:
@@ -149,9 +162,7 @@ def register_prepared(
     _check_fused(best, scan, model)
     _check_fit(best, scan, model, config)
     _check_hand(best, scan, model)
-    _check_known(best, model, matters_P, config)
-    best, runner_up, note = _decided(best, rivals, scan, model, hint, matters_P, config)
-    return _result(best, runner_up, note, model, matters_P)
+    return Candidates(best, rivals, hint, config)
 
 
 def _check_size(scan: PreparedScan, model: PartModel) -> None:
