@@ -144,11 +144,6 @@ def mean_pose(X: Array) -> Array:
     return pose(nearest_rotation(X[:, :3, :3].sum(axis=0)), np.median(X[:, :3, 3], axis=0))
 
 
-def random_rotations(n: int, rng: np.random.Generator) -> Array:
-    """Rotations (n, 3, 3), uniform over all of them."""
-    return np.asarray(Rotation.random(n, rng=rng).as_matrix()).reshape(n, 3, 3)
-
-
 def mean_of(poses: list[Array]) -> Array:
     """Return the pose M with sum log(M^-1 X_k) = 0 on SE(3).
 

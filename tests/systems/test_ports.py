@@ -54,7 +54,7 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
-from weldcal.systems.drivers.simulated.streaming_scanner import DepthStream, FrameReplay, StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import DepthStream, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
@@ -196,7 +196,6 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     WiredScanStream: lambda: WiredScanStream(acquisition()),
     WiredPictures: lambda: WiredPictures(acquisition()),
     FrameQueue: FrameQueue,
-    FrameReplay: lambda: FrameReplay([np.zeros((2, 2, 3), np.float32)], lambda time: Q_HOME, 20.0, 0.1),
     MotionProcedure: lambda: MotionProcedure((Q_HOME, Q_HOME), Q_HOME, 40),
     MotionCollector: MotionCollector,
     MotionCalibrator: lambda: MotionCalibrator(the_arm()),
@@ -379,7 +378,6 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     OnTrigger: {"trigger": 1, "scan": Scan},
     WiredScanStream: {"streaming": 1, "stream": ScanStream},
     WiredPictures: {"streaming": 1, "image": Image, "capture_time": 1},
-    FrameReplay: {"stream": ScanStream, "joints": 6, "time": 1},
     FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},
     MotionProcedure: {
         "settled_goal": 1,

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, _system, edge_joint
 from weldcal.calibration.profiler.edge.linear import EdgeLinear, edge_linear
-from weldcal.calibration.profiler.edge.model import EdgeState, predicted
+from weldcal.calibration.profiler.edge.model import EdgeState, left_covariance, predicted
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 
@@ -265,3 +265,17 @@ def _ball(truth: EdgeState, noise: EdgeNoise, rng: np.random.Generator) -> tuple
     a = np.linspace(-0.9, 0.9, 60)
     p = np.stack([c[:, :1] + r * np.sin(a), c[:, 2:] - r * np.cos(a)], axis=2)
     return FlangePoses(R, t + noise.robot_m * rng.standard_normal(t.shape)), _noisy(p, noise, rng)
+
+
+def edge_crb(
+    state: EdgeState, rotation: ArrayLike, translation: ArrayLike, *, sigma_robot_m: float, sigma_xz_m: ArrayLike
+) -> Floats:
+    """Cramer-Rao bound (6, 6) of [rotation in F.
+
+    Translation] for these poses and sigmas: no unbiased method does better.
+    """
+    poses = FlangePoses.checked(rotation, translation)
+    p, _, _ = predicted(state, poses)
+    _, _, J = _system(state, poses, p, sigma_robot_m, np.asarray(sigma_xz_m, float))
+    flat = J.reshape(-1, 10)
+    return left_covariance(state.rotation, np.asarray(np.linalg.pinv(flat.T @ flat)))

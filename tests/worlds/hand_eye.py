@@ -15,7 +15,6 @@ from weldcal.calibration.geometry.se3 import (
     inverse,
     nearest_rotation,
     pose,
-    random_rotations,
     scaled,
 )
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
@@ -34,6 +33,11 @@ their own (normal, or Student's t of three degrees of freedom); "far target": a 
 _ARMS = ("ur10e", "ur5e")
 _WIDTH, _HEIGHT = 1280.0, 960.0
 _LEAST = 6  # corners in an image that is kept
+
+
+def random_rotations(n: int, rng: np.random.Generator) -> Array:
+    """Rotations (n, 3, 3), uniform over all of them."""
+    return np.asarray(Rotation.random(n, rng=rng).as_matrix()).reshape(n, 3, 3)
 
 
 @dataclass(frozen=True)

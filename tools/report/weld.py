@@ -96,19 +96,6 @@ class WeldOutcome:
     plans: tuple[tuple[int, int], ...] = ()  # numbers of seam and pass of each of `seams`, from 0
 
 
-@dataclass(frozen=True, eq=False)
-class FeltSeam:
-    """The points (N,) m of the refined seam.
-
-    Arc length on the true seam, and distance to the left of and above the nominal line of a seated tip's measured
-    centre.
-    """
-
-    s: Array
-    lateral: Array
-    height: Array
-
-
 @dataclass(frozen=True)
 class CalibrationError:
     """Error of X_BC against the ground truth: at the camera's origin, and for a point at the work point."""
@@ -161,18 +148,6 @@ def true_seam(truth: Truth, seam: int = 0) -> SeamCurve | None:
     R = truth.X_BP.rotation().matrix()
     line, ups, turn_m = ringed(line @ R.T + truth.X_BP.translation(), np.broadcast_to(ups, line.shape) @ R.T)
     return SeamCurve.from_points(line, up=ups, length=turn_m)
-
-
-def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
-    """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
-    number = cell.job.command(root).seam
-    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth, number)
-    if state is None or seam is None or len(state.refined) < 10:
-        return None
-    seat = seated_tip(cell.station, number)
-    line = seam.raised(seat.above_m - TORCH_ABOVE_ROOT_M, seat.aside_m)
-    found = path_error(state.refined.points, line)
-    return FeltSeam(found.s, found.lateral, found.height)
 
 
 def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:

@@ -377,17 +377,3 @@ def with_sensor(
     both = both[e.inliers].reshape(-1, 13)
     G = np.linalg.lstsq(both[:, :10], both[:, 10:], rcond=None)[0]
     return np.asarray(e.covariance + left_covariance(e.rotation, G @ sensor.covariance @ G.T))
-
-
-def edge_crb(
-    state: EdgeState, rotation: ArrayLike, translation: ArrayLike, *, sigma_robot_m: float, sigma_xz_m: ArrayLike
-) -> Floats:
-    """Cramer-Rao bound (6, 6) of [rotation in F.
-
-    Translation] for these poses and sigmas: no unbiased method does better.
-    """
-    poses = FlangePoses.checked(rotation, translation)
-    p, _, _ = predicted(state, poses)
-    _, _, J = _system(state, poses, p, sigma_robot_m, np.asarray(sigma_xz_m, float))
-    flat = J.reshape(-1, 10)
-    return left_covariance(state.rotation, np.asarray(np.linalg.pinv(flat.T @ flat)))

@@ -1,7 +1,7 @@
 """Simulated streaming scanner, rendered while the cell runs or replayed from frames that were rendered before."""
 
 import dataclasses as dc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -12,7 +12,6 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, State
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from weldcal.models.arrays import Array
 from weldcal.models.scanner_streams import ScannerStream, get_stream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
 from weldcal.systems.drivers.config import check_range
@@ -207,42 +206,3 @@ def _add_static_mode(config: StreamingScanner, build: StationBuild, mounted: Mou
     build.add("scanner_at_rest", scans, "scanner.trigger", "scanner.scan")
     build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), scans.GetInputPort("depth_image"))
     build.builder.Connect(mounted.sensor.color_image_output_port(), scans.GetInputPort("color_image"))
-
-
-class FrameReplay(LeafSystem):
-    """Outputs clouds in turn, again and again.
-
-    .. pydrake_system::
-
-        name: FrameReplay
-        output_ports:
-        - stream
-        - joints
-        - time
-
-    A frame arrives ``delay_s`` after its capture. ``joints`` gives the arm's (6,) rad at a time (s) from the first
-    cloud on.
-    """
-
-    def __init__(
-        self, clouds: Sequence[NDArray[np.float32]], joints: Callable[[float], Array], rate_hz: float, delay_s: float
-    ) -> None:
-        super().__init__()
-        self._clouds, self._motion, self._rate_hz, self._delay_s = clouds, joints, rate_hz, delay_s
-        self.DeclareAbstractOutputPort("stream", lambda: AbstractValue.Make(ScanStream()), self._stream)
-        self.DeclareVectorOutputPort("joints", 6, self._joints)
-        self.DeclareVectorOutputPort("time", 1, self._time)
-
-    def _stream(self, context: Context, output: Any) -> None:
-        newest = int((context.get_time() - self._delay_s) * self._rate_hz + 1e-9)
-        frames = []
-        for n in range(max(1, newest - _SHOWN + 1), newest + 1):
-            capture, points = n / self._rate_hz, self._clouds[n % len(self._clouds)]
-            frames.append(StreamedScan(n, points_C=points, arrival_time=capture + self._delay_s, device_time=capture))
-        output.set_value(ScanStream(tuple(frames)))
-
-    def _joints(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._motion(float(np.mod(context.get_time(), len(self._clouds) / self._rate_hz))))
-
-    def _time(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_time())

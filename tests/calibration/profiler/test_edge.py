@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
+from tests.worlds.edge_trials import edge_crb
 from weldcal.calibration.errors import (
     DegenerateMotion,
     FeatureNotFound,
@@ -18,7 +19,7 @@ from weldcal.calibration.errors import (
     TooFewTranslations,
 )
 from weldcal.calibration.profiler.edge.features import extract_edge
-from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses

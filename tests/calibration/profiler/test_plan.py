@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge.joint import edge_crb
+from tests.worlds.edge_trials import edge_crb
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import (

@@ -6,17 +6,18 @@ process are the cell's own; the arm's control is a simulated arm at 500 Hz in th
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from tests.figures.harness import Run, figure
@@ -37,9 +38,8 @@ from weldcal.models.arms.urdf import link_index, link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
-from weldcal.systems.drivers.simulated.streaming_scanner import FrameReplay
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, ScanStream, StreamedScan
 from weldcal.systems.motion.buffers import FrameQueue, PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
@@ -50,6 +50,48 @@ from weldcal.tools.dashboard.scan_overlay import overlay_picture
 LINK = "wrist_1_link"
 Draw = Callable[[MotionDataset, CalibrationResult, DriftHistory], None]
 _SIGMA = 1e-5  # rad and m: the calibration of the study is the truth, so that what is left is tracking
+
+
+_SHOWN = 4  # newest frames on the port
+
+
+class FrameReplay(LeafSystem):
+    """Outputs clouds in turn, again and again.
+
+    .. pydrake_system::
+
+        name: FrameReplay
+        output_ports:
+        - stream
+        - joints
+        - time
+
+    A frame arrives ``delay_s`` after its capture. ``joints`` gives the arm's (6,) rad at a time (s) from the first
+    cloud on.
+    """
+
+    def __init__(
+        self, clouds: Sequence[NDArray[np.float32]], joints: Callable[[float], Array], rate_hz: float, delay_s: float
+    ) -> None:
+        super().__init__()
+        self._clouds, self._motion, self._rate_hz, self._delay_s = clouds, joints, rate_hz, delay_s
+        self.DeclareAbstractOutputPort("stream", lambda: AbstractValue.Make(ScanStream()), self._stream)
+        self.DeclareVectorOutputPort("joints", 6, self._joints)
+        self.DeclareVectorOutputPort("time", 1, self._time)
+
+    def _stream(self, context: Context, output: Any) -> None:
+        newest = int((context.get_time() - self._delay_s) * self._rate_hz + 1e-9)
+        frames = []
+        for n in range(max(1, newest - _SHOWN + 1), newest + 1):
+            capture, points = n / self._rate_hz, self._clouds[n % len(self._clouds)]
+            frames.append(StreamedScan(n, points_C=points, arrival_time=capture + self._delay_s, device_time=capture))
+        output.set_value(ScanStream(tuple(frames)))
+
+    def _joints(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._motion(float(np.mod(context.get_time(), len(self._clouds) / self._rate_hz))))
+
+    def _time(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_time())
 
 
 def track_body(options: MotionOptions, link: str, tell: Progress, draw: Draw | None = None) -> dict[str, DriftHistory]:

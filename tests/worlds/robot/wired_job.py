@@ -93,7 +93,8 @@ def run_job(
         before = controller.ask(check="summary")
         with _thrown(world, happening, stage, thrown):
             result = run_scenario(scenario, RunOptions(scenario="wired", out=folder, seed=seed, recording=False), watch)
-        result.run.raise_if_interrupted()
+        if result.run.interrupted is not None:
+            raise KeyboardInterrupt(result.run.interrupted)
         ended = time.monotonic()
         held = result.state != "done"
         if held:

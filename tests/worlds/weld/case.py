@@ -5,20 +5,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import Context
 
 from tests.worlds.weld.budgets import BUDGETS, Budget
 from tests.worlds.weld.laws import steering
 from tests.worlds.weld.plant import PHASES, StudyRun, simulate
 from tests.worlds.weld.seams import get_seam
 from tests.worlds.weld.speed import speed_statistics
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import seated_tip
 from weldcal.tools.report.demo import DemoResult
-from weldcal.tools.report.weld import FeltSeam, felt_seam
+from weldcal.tools.report.weld import true_seam
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import ProcessLogError, path_error
 from weldcal.welding.record.welded_seam import evenness
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchOnConfig
+from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, ServoConfig, ToolGeometry, TouchOnConfig
 from weldcal.welding.servo.state import Phase
 
 _WELDING = [PHASES.index(p) for p in (Phase.TRACK, Phase.COAST, Phase.FINISH)]
@@ -245,6 +249,31 @@ class CellRun:
     space_max_mm: float = np.nan
     cv_percent: float = np.nan
     real_time_factor: float = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class FeltSeam:
+    """The points (N,) m of the refined seam.
+
+    Arc length on the true seam, and distance to the left of and above the nominal line of a seated tip's measured
+    centre.
+    """
+
+    s: Array
+    lateral: Array
+    height: Array
+
+
+def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
+    """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
+    number = cell.job.command(root).seam
+    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth, number)
+    if state is None or seam is None or len(state.refined) < 10:
+        return None
+    seat = seated_tip(cell.station, number)
+    line = seam.raised(seat.above_m - TORCH_ABOVE_ROOT_M, seat.aside_m)
+    found = path_error(state.refined.points, line)
+    return FeltSeam(found.s, found.lateral, found.height)
 
 
 def figures(result: DemoResult, name: str, seed: int) -> CellRun:
