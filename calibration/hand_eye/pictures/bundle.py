@@ -22,9 +22,9 @@ _MOST = 400  # points of a board up to which each has corrections of its own: be
 _ARM_M, _USUAL = 0.3, 2.0  # a joint's error moves the flange by it times a forearm; what that weighs, in numbers
 _START = 0.1  # of SAG: size of the errors of single points to begin with
 
-SCALE = 2e-3  # of the print in either direction; office printers, 0.1 to 0.3 %: Strobl and Hirzinger 2011
-SKEW = 1e-3  # of the print, rad: half of SCALE, paper is fed straighter than evenly (the same)
-SAG = 3e-3  # of the board's longer side; printed sheets on a carrier, 0.1 to 0.5 %: Albarelli et al. 2009
+SCALE = 2e-3  # a choice: of the print in either direction, office printers 0.1 to 0.3 %
+SKEW = 1e-3  # a choice: of the print, rad, half of SCALE: paper is fed straighter than evenly
+SAG = 3e-3  # a choice: of the board's longer side, printed sheets on a carrier 0.1 to 0.5 %
 _PRINT = 3e-5  # of the longer side: where the estimates of single points end; 0.01 mm of a sheet of paper
 
 
