@@ -188,7 +188,7 @@ def _too_few(
 ) -> str:
     """Return the sentence where too few scans show the circle; a wider search says how far off the guess is."""
     n, refused = len(found.seen), found.refused
-    begin = f"{n} scan{'' if n == 1 else 's'} show the circle, and {fewest(scene)} are needed."
+    begin = f"{n} scan{' shows' if n == 1 else 's show'} the circle, and {fewest(scene)} are needed."
     for id, _ in refused[:_TRIED_AGAIN]:
         with contextlib.suppress(FlangeNotFound, CloudError):
             wide = see_circle(data.cloud(id), scene, id, *joints[id], replace(circle, guess_radius_m=_WIDER_M))

@@ -22,6 +22,7 @@ from weldcal.calibration.capture.session import (
     Shown,
     jog,
     jog_joints,
+    require_mounting,
 )
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
@@ -39,6 +40,7 @@ from weldcal.models.files import write_atomic
 
 _WIDE_M = 0.25  # a choice: radius of the search for a circle that is not where the pose expects it
 _APART_M, _APART_GUESS_M = 0.015, 0.05  # a choice: by how much two scans may disagree, with a result and with a guess
+_SETTLED_AFTER, _SETTLED = 4, 0.95  # a choice: errors of the last captures, of which the newest is hardly less
 _SHUN_RAD, _SAME_RAD = 0.15, 0.03  # a choice: about joints at which a scan was of no use, and about those taken
 
 
@@ -50,7 +52,7 @@ class CarriedTask:
 
     def __init__(self, header: DatasetHeader, scene: MountingScene, circle: Circle, plan: MountingPlan) -> None:
         if scene.two:
-            raise InputError("Two arms are calibrated by weldcal calibrate SCENARIO; capture has the pose of one.")
+            raise InputError("Capture has the pose of one arm. Two are calibrated by: weldcal calibrate --scenario NAME")
         self._header, self.scene, self._circle, self._plan = header, scene, circle, plan
         self.symbol, self.least = scene.mounting.unknowns["X"].symbol, fewest(scene)
         self._found: CarriedCalibration | None = None
@@ -60,6 +62,7 @@ class CarriedTask:
 
     def prepare(self, folder: Path) -> None:
         """See CaptureTask."""
+        require_mounting(folder, self._header.configuration)
         header = replace(self._header, schema=1, units=Units(AUTO, AUTO), poses=PoseForm(file=POSES_FILE))
         lines = {k: v for k, v in asdict(header).items() if v not in (None, "", 0.0)}
         write_atomic(folder / "dataset.yaml", yaml_dump(lines))
@@ -140,13 +143,24 @@ class CarriedTask:
         ]
         return CaptureVerdict(
             symbol=self.symbol,
-            said=(*result.unobservable, *result.warnings),
+            said=(*result.unobservable, *result.warnings, *self._floor(found)),
             X=result.X,
             error_95_m=error,
             odd=(*odd, *found.refused),
             advice=self._next(found, last),
             placed=tuple(placed),
         )
+
+    def _floor(self, found: CarriedCalibration) -> list[str]:
+        """A sentence where more captures hardly lower the error."""
+        errors = [error for _, error in found.history[-_SETTLED_AFTER:]]
+        if len(errors) < _SETTLED_AFTER or errors[-1] < _SETTLED * errors[0]:
+            return []
+        arm = self.scene.arm_error_m
+        return [
+            f"The last {_SETTLED_AFTER - 1} captures hardly lowered the error: it comes from the arm, whose flange is"
+            f" off by {1e3 * arm:.1f} mm (rms; arm_error_mm in dataset.yaml), not from the number of captures."
+        ]
 
     def command(self, folder: Path) -> str:
         """See CaptureTask."""

@@ -14,6 +14,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.clouds import cloud_id, ending_of
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.geometry.se3 import log_rotation
@@ -155,7 +156,7 @@ class CaptureTask(Protocol):
     """How to vary the poses while there is no advice."""
 
     def prepare(self, folder: Path) -> None:
-        """Write what the folder needs besides captures."""
+        """Write what the folder needs besides captures. Raises InputError where it is that of another mounting."""
 
     def look(self, id: str, path: Path, pose: ArmPose) -> tuple[Shown | None, str]:
         """Return what a file shows, taken at a pose, and why it cannot be used ("": it can)."""
@@ -199,10 +200,11 @@ class CaptureSession:
         self.folder, self.task = folder, task
         self.captures: list[Capture] = []
         self._checks: CaptureSession | None = None
-        other = next((name for name in FOLDERS if name != task.folder and (folder / name).is_dir()), None)
+        other = next((name for name in FOLDERS if name != task.folder and any((folder / name).glob("*"))), None)
         if other is not None:
             raise InputError(f"'{folder}' is a session of {other}, not of {task.folder}: name another folder.")
         (folder / task.folder).mkdir(parents=True, exist_ok=True)
+        task.prepare(folder)
         rows = self._rows()
         for hidden in (folder / task.folder).glob(".*"):
             if any(row["id"] == cloud_id(hidden.with_name(hidden.name[1:])) for row in rows):
@@ -214,7 +216,6 @@ class CaptureSession:
             id, pose = row["id"], _pose_of(row)
             if id in files:
                 self.captures.append(Capture(id=id, file=files[id], pose=pose, found=task.look(id, files[id], pose)[0]))
-        task.prepare(folder)
 
     def take(self, source: Path, pose: ArmPose, after: ArmPose | None = None) -> Capture:
         """Judge a file of the sensor with the arm's pose, and keep both; ``after``: the pose after the exposure.
@@ -306,6 +307,15 @@ class CaptureSession:
             writer.writerow([one.id, *map(repr, one.pose.row())])
         write_atomic(self.folder / POSES_FILE, table.getvalue())
         self.captures = captures
+
+
+def require_mounting(folder: Path, configuration: str) -> None:
+    """Require that a session which is there is of this mounting. Raises InputError."""
+    there = folder / "dataset.yaml"
+    if there.is_file() and (other := read_header(there).configuration) != configuration:
+        raise InputError(
+            f"'{folder}' is a session of the mounting {other}, not {configuration}: name another folder with --out."
+        )
 
 
 def jog(now: ArmPose, goal: RigidTransform) -> str:

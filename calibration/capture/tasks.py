@@ -26,12 +26,13 @@ from weldcal.calibration.capture.session import (
     CaptureVerdict,
     Shown,
     jog,
+    require_mounting,
 )
 from weldcal.calibration.data.camera_file import read_camera
 from weldcal.calibration.data.checks import AUTO, to_metres
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.dataset import load_dataset
-from weldcal.calibration.data.results import export_all, save_result
+from weldcal.calibration.data.results import ON_BASE, export_all, save_result
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import FlangeScan, fit_flanges, flange_scan
@@ -62,6 +63,7 @@ _SHARP_PX = 8.0  # a choice: from dark to bright across an edge; sharp pictures 
 _SMALL_PX = 8.0  # a choice: between neighbours of a board; a corner is found to a twentieth of it at best
 _DARK, _BRIGHT = 40, 230  # a choice: grey values; a board in them has no contrast left
 _TRIED = 200  # a choice: the best of so many poses lies in the best 1 % of all (chance 0.87)
+_FACE_M = 0.06  # a choice: half the width of a flange and what is about it, ISO 9409-1-80 has 0.05
 _WIDER, _ASIDE = 1.15, 0.1  # a choice: how far beyond the places so far the next one may lie; at least so far aside
 _TILT_RAD = np.radians(30.0)  # paper, section 2.1.4: the largest angle of the face to the line of sight
 HOME_Q = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
@@ -79,10 +81,12 @@ class FlangeTask:
         self._robot, self._known = robot, dict[str, FlangeScan]()
         self._X_BC: RigidTransform | None = None
         self._shunned: list[RigidTransform] = []
+        self._view = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])  # tangents x/z and y/z that scans reach
 
     def prepare(self, folder: Path) -> None:
         """See CaptureTask."""
-        document = {"schema": 1, "configuration": "eye_on_base", "flange": self._standard.designation}
+        require_mounting(folder, ON_BASE)
+        document = {"schema": 1, "configuration": ON_BASE, "flange": self._standard.designation}
         document |= {"units": {"clouds": "auto", "poses": "auto"}, "poses": {"file": POSES_FILE}}
         write_atomic(folder / "dataset.yaml", yaml_dump(document | ({"robot": self._robot} if self._robot else {})))
 
@@ -92,6 +96,11 @@ class FlangeTask:
             points = to_metres(read_cloud(path).astype(float), AUTO, path.name)
         except CloudError as refusal:
             return None, refusal.reason
+        xyz = points.reshape(-1, 3)
+        tangents = (xyz[:, :2] / xyz[:, 2:])[np.isfinite(xyz).all(axis=1) & (xyz[:, 2] > 0.0)]
+        if len(tangents):
+            low, high = tangents.min(axis=0), tangents.max(axis=0)
+            self._view = np.array([np.minimum(self._view[0], low), np.maximum(self._view[1], high)])
         found = self._known[id] = flange_scan(points, self._standard)
         if not isinstance(found, tuple):
             return None, f"{found.reason} Let the flange face the scanner, whole and near the middle of its view."
@@ -144,7 +153,9 @@ class FlangeTask:
             seen = fit_flanges(data, self._standard, known=self._known)
             with suppress(WeldcalError):  # of few, poses in one plane or at one place are enough for what comes next
                 X_BC = self._X_BC or calibrate_from_few(seen.observations[-LEAST:], seen.patterns, None).X_BC
-                advice = next_scan(seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last, self._shunned)
+                advice = next_scan(
+                    seen.observations, X_BC, (seen.data or data).X_FR, self._robot, last, self._shunned, self._view
+                )
                 return CaptureVerdict(symbol=self.symbol, said=(str(refusal),), advice=advice)
             raise
         estimate, used = found.estimate, found.inliers
@@ -160,7 +171,11 @@ class FlangeTask:
         read = found.seen.data
         if read is not None and last.X_BF is None:
             last = ArmPose(X_BF=list(read.poses.values())[-1])
-        advice = None if read is None else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last, self._shunned)
+        advice = (
+            None
+            if read is None
+            else next_scan(used, estimate.X_BC, read.X_FR, self._robot, last, self._shunned, self._view)
+        )
         off = position_errors(estimate.X_BC, found.observations)
         return CaptureVerdict(
             symbol=self.symbol,
@@ -331,6 +346,7 @@ def next_scan(
     robot: str,
     last: ArmPose,
     shunned: Sequence[RigidTransform] = (),
+    view: Array | None = None,
 ) -> Advice | None:
     """Return the pose that lowers the error at the work point most, of those before the scanner within reach.
 
@@ -339,6 +355,7 @@ def next_scan(
         X_BC: the scanner in the base, as they give it. X_FR: the feature on the flange.
         robot: an arm whose reach is looked at; any other name: it is not.
         last: where the arm is. shunned: poses X_BF at which a scan was of no use.
+        view: least and largest x/z and y/z (2, 2) that the scanner sees; the flange is then whole in it.
     """
     rng, taken = np.random.default_rng(len(seen)), [o.X_BR for o in seen]
     arm = load_arm(robot) if robot in known_arms() else None
@@ -350,8 +367,16 @@ def next_scan(
     tried: list[tuple[float, RigidTransform]] = []
     for _ in range(_TRIED):
         place = rng.uniform(*depth) * np.array([*rng.uniform(-side, side), 1.0])
+        edge = _FACE_M / place[2]
+        if (
+            view is not None
+            and not ((place[:2] / place[2] - edge > view[0]) & (place[:2] / place[2] + edge < view[1])).all()
+        ):
+            continue
         X_BR = X_BC @ RigidTransform(_facing(place, rng), place)
         tried.append((predicted_sigma([*taken, X_BR], X_BC, config), X_BR @ X_FR.inverse()))
+    if view is not None and not tried:  # a scanner that sees little but the flange
+        return next_scan(seen, X_BC, X_FR, robot, last, shunned)
     q = HOME_Q if last.q is None else last.q
     for sigma, X_BF in sorted(tried, key=lambda one: one[0]):
         near = [ArmPose(X_BF=X_BF).moved(ArmPose(X_BF=X)) for X in shunned]

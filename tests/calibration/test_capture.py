@@ -20,8 +20,9 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.figures.hand_eye.guidance import CAPTURES, at_random, error_m, looked_at
+from tests.figures.hand_eye.sessions import cell_and_task
 from tests.places import SHARED_DATA, require_data
-from weldcal.calibration.capture.session import POSES_FILE, ArmPose, Capture, CaptureSession, jog
+from weldcal.calibration.capture.session import POSES_FILE, ArmPose, Capture, CaptureSession, jog, require_mounting
 from weldcal.calibration.capture.tasks import BoardTask, FlangeTask, next_scan
 from weldcal.calibration.data.clouds import read_cloud, save_cloud
 from weldcal.calibration.data.dataset import load_dataset
@@ -367,3 +368,35 @@ def test_pictures_of_a_standing_board_while_the_arm_moves_are_refused(tmp_path: 
     assert one is not None
     assert "the picture is an older one" in one.refused
     assert replace(one, refused="").file.parent.name == "pictures"
+
+
+def test_a_session_of_another_mounting_is_refused_and_left_as_it_is(begun: CaptureSession) -> None:
+    before = (begun.folder / "dataset.yaml").read_text()
+    with pytest.raises(InputError, match="a session of the mounting eye_on_base, not eye_in_hand: name another folder"):
+        require_mounting(begun.folder, "eye_in_hand")
+    loaded = cell_and_task("eye_in_hand", 1)[1]
+    with pytest.raises(InputError, match="name another folder"):
+        CaptureSession(begun.folder, loaded)
+    assert (begun.folder / "dataset.yaml").read_text() == before
+
+
+def test_the_next_scan_lies_whole_in_what_the_scanner_sees() -> None:
+    """A scanner with a narrow view, and scans near its edge."""
+    rng, X_BC = np.random.default_rng(2), RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.5, 0.0, 1.2])
+    seen = [looked_at(X_BC, at_random(rng, 0.4), np.zeros(3), rng) for _ in range(4)]
+    view = np.array([[-0.15, -0.2], [0.3, 0.2]])
+    beyond = 0
+    for k in range(12):
+        part = seen[: 3 + k % 2]
+        for limits in (view, None):
+            advice = next_scan(part, X_BC, RigidTransform(), "", ArmPose(), (), limits)
+            assert advice is not None
+            assert advice.X_BF is not None
+            p = X_BC.inverse() @ advice.X_BF.translation()
+            inside = (p[:2] / p[2] > view[0] + 0.06 / p[2] - 1e-9).all() and (
+                p[:2] / p[2] < view[1] - 0.06 / p[2]
+            ).all()
+            assert inside or limits is None
+            beyond += not inside
+        seen = [looked_at(X_BC, at_random(rng, 0.4), np.zeros(3), rng) for _ in range(4)]
+    assert beyond, "without the limits some lie beyond"

@@ -101,5 +101,5 @@ def test_an_arm_link_needs_joint_angles(tmp_path: Path) -> None:
 
 
 def test_two_arms_are_refused_with_the_command_that_does_it() -> None:
-    with pytest.raises(InputError, match="weldcal calibrate SCENARIO"):
+    with pytest.raises(InputError, match="weldcal calibrate --scenario NAME"):
         carried("co_manipulation")

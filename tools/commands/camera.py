@@ -1,5 +1,6 @@
 """weldcal camera: camera matrix and distortion with their covariance, from pictures of a board."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +35,7 @@ def camera(
     out = call.folder("camera", pictures.resolve().name)
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / "camera.yaml", yaml.safe_dump(camera_document(found.camera), sort_keys=False))
-    first = camera_screen(found)
+    first = camera_screen(found, out / "camera.yaml")
     write_atomic(out / "report.html", camera_page(found, first, pictures))
     values = dict(camera_rows(found))
     summary: dict[str, Any] = {"state": "done", "out": str(out), "file": str(out / "camera.yaml")}
@@ -85,8 +86,8 @@ def camera_rows(found: CameraEstimate) -> list[tuple[str, str]]:
     ]
 
 
-def camera_screen(found: CameraEstimate) -> FirstScreen:
-    """Return the first screen of a camera."""
+def camera_screen(found: CameraEstimate, file: Path) -> FirstScreen:
+    """Return the first screen of a camera that is written to a file."""
     fx, sigma = found.camera.K[0, 0], found.sigma[0]
     concerns = [found.change.sentence] if found.change is not None and found.change.changed else []
     lost = left_out(found)
@@ -97,7 +98,7 @@ def camera_screen(found: CameraEstimate) -> FirstScreen:
     return FirstScreen(
         Findings(unseen=found.held_out, concerns=concerns, notes=notes, no_tolerance=_NO_LIMIT),
         ExpectedError("standard deviation of the focal length", f"{sigma:.2f} px, {100 * sigma / fx:.3f} %", backing),
-        Next("Give the file to 'weldcal hand-eye' with --as intrinsics=camera.yaml.", uses=True),
+        Next(f"Give the file to 'weldcal hand-eye' with --as intrinsics={shlex.quote(str(file))}.", uses=True),
         (),
         dict(camera_rows(found)[:2]),
     )

@@ -50,7 +50,7 @@ def capture(
     ] = None,
     mounting: Annotated[
         str, option("--mounting", "NAME", "Of the camera: eye_in_hand (on the flange) or eye_on_base.")
-    ] = "eye_in_hand",
+    ] = "",
     profiler: Annotated[
         str,
         option(
@@ -62,8 +62,11 @@ def capture(
     robot: Annotated[str, option("--robot", "NAME", "The arm, such as ur10e.")] = "",
     flange: Annotated[str, option("--flange", "NAME", "The flange, where the arm's own does not say.")] = "",
     required_mm: Annotated[
-        float, option("--required-mm", "MM", "The error at the work point that is wanted.", min=0.001)
-    ] = 0.2,
+        float | None,
+        option(
+            "--required-mm", "MM", "The error at the work point that is wanted: of the scenario, or 0.2.", min=0.001
+        ),
+    ] = None,
     demo: Annotated[
         bool, switch("--demo", "With an emulated arm and scanner; the page's buttons jog the arm.")
     ] = False,
@@ -74,23 +77,34 @@ def capture(
     Nothing is sent to the robot. All captures are in `captures` of --out, which `weldcal calibrate` or
     `weldcal hand-eye` reads; a session that is there goes on. Ctrl+C ends it.
     """
-    if mounting not in ("eye_in_hand", "eye_on_base"):
+    if mounting not in ("", "eye_in_hand", "eye_on_base"):
         raise InputError(f"--mounting must be eye_in_hand (on the flange) or eye_on_base, not '{mounting}'.")
-    if demo and (watch or webcam or poses or board):
-        raise InputError("--demo brings its own arm and scanner: leave out the sensor, --poses and --board.")
-    carried = None if scenario is None else _carried(scenario, call.seed)
+    if mounting and not board:
+        raise InputError("--mounting is that of a camera: give --board with it. A scanner's is in the scenario.")
+    if demo and (watch or webcam or poses or board or profiler):
+        raise InputError(
+            "--demo brings its own arm and scanner: leave out the sensor, --poses, --board and --profiler."
+        )
+    if out.is_dir() and any(out.iterdir()) and not (out / "captures").is_dir():
+        raise InputError(f"'{out}' holds other files: name another folder with --out.")
+    carried, wanted_mm = (None, 0.2) if scenario is None else _carried(scenario, call.seed)
+    if demo and scenario and carried is None:
+        raise InputError(
+            f"The scanner of '{scenario}' is not on the arm: leave the scenario out for a scanner beside the arm, or"
+            " take eye_in_hand or eye_on_arm."
+        )
     cell = DemoCell(call.seed, None if carried is None else carried.scene) if demo else None
-    sensor = cell or _sensor(scenario, watch, webcam)
-    arm: ArmSource = cell or arm_source(poses)
     robot = ROBOT if demo else robot
     task: CaptureTask
     if board:
-        task = BoardTask(board, mounting, robot, call.reading.get("intrinsics"))
+        task = BoardTask(board, mounting or "eye_in_hand", robot, call.reading.get("intrinsics"))
     elif profiler:
         task = ProfileTask(profiler, robot)
     else:
         task = carried or FlangeTask(robot, flange or _flange_of(robot))
-    run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm, "weldcal capture")
+    sensor = cell or _sensor(scenario, watch, webcam)
+    arm: ArmSource = cell or arm_source(poses)
+    run = CaptureRun(CaptureSession(out / "captures", task), arm, sensor, required_mm or wanted_mm, "weldcal capture")
     with claimed(out, overwrite=True), closing(run):
         _serve(run, call.live["browser"], robot if carried is None else carried.scene.arm.name)
     return {
@@ -120,16 +134,16 @@ def _serve(run: CaptureRun, browser: bool, robot: str) -> None:
             return
 
 
-def _carried(scenario: str, seed: int) -> CarriedTask | None:
-    """Return the task of a scenario whose scanner is carried by the arm; None where it does not move."""
+def _carried(scenario: str, seed: int) -> tuple[CarriedTask | None, float]:
+    """Return the task of a scenario whose scanner is on the arm (None: beside it), and the wanted error, mm."""
     from weldcal.systems.jobs.mounting.job import mounting_plan, mounting_scene
     from weldcal.systems.scenario.loading import load_scenario
 
     loaded = load_scenario(scenario)
     if loaded.calibration.configuration == ON_BASE:
-        return None
+        return None, loaded.calibration.required_error_mm
     header, scene, circle = mounting_scene(loaded, load_arm(loaded.arm))
-    return CarriedTask(header, scene, circle, mounting_plan(loaded, seed))
+    return CarriedTask(header, scene, circle, mounting_plan(loaded, seed)), loaded.calibration.required_error_mm
 
 
 def _flange_of(robot: str) -> str:

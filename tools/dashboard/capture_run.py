@@ -236,7 +236,7 @@ class CaptureRun:
             "error_mm": error,
             "required_mm": self.required_mm,
             "said": list(v.said),
-            "advice": None if v.advice is None else v.advice.words,
+            "advice": None if v.advice is None else self._from_where() + v.advice.words,
             "hint": self.session.task.hint,
             "gain": None if v.advice is None else v.advice.gain,
             "ur_pose": None if v.advice is None else v.advice.ur,
@@ -246,6 +246,10 @@ class CaptureRun:
             "folder": str(self.session.folder.absolute()),
             "command": self.session.task.command(self.session.folder),
         }
+
+    def _from_where(self) -> str:
+        """Where the words of the next pose begin: at the last capture, which need not be where the arm is."""
+        return f"From {self.session.captures[-1].id}: " if self.session.captures else ""
 
     def _work(self) -> None:
         stood, since = ArmPose(), time.monotonic()
@@ -286,7 +290,7 @@ class CaptureRun:
             self.session.take_back(wish.removeprefix("back-"))
         elif wish == "use":
             self.session.task.save(self.session.folder)
-            self.used, self.verdict, self.last = True, replace(self.verdict, advice=None), None
+            self.used, self.verdict, self.last = True, replace(self.verdict, said=(), advice=None), None
             return
         self.state = THINKING
         if not self.used:

@@ -452,7 +452,8 @@ def camera() -> Made:
     from weldcal.tools.commands.camera import camera_page, camera_screen
 
     found = camera_estimate()
-    return camera_screen(found), camera_page(found, camera_screen(found), Path("pictures"))
+    first = camera_screen(found, Path("camera.yaml"))
+    return first, camera_page(found, first, Path("pictures"))
 
 
 def finger() -> Made:

@@ -7,7 +7,8 @@ let heardAt = Date.now(), pictured = 0, last = null;
 
 const say = (id, text) => { const e = el(id); if (e.textContent !== text) e.textContent = text; };
 const show = (id, on) => { el(id).hidden = !on; };
-const ask = (what, value) => fetch("act/" + what, { method: "POST", headers: { "Content-Type": "application/json", "X-Weldcal-Key": key }, body: JSON.stringify({ value }) });
+const ask = (what, value) => fetch("act/" + what, { method: "POST", headers: { "Content-Type": "application/json", "X-Weldcal-Key": key }, body: JSON.stringify({ value }) })
+  .then(answer => { if (answer.status === 403) location.reload(); });  // the program was started anew: its key is another one
 const capture = () => { if (!el("capture").disabled) ask("capture", el("pose").value); };
 
 function list(id, items, back) {
@@ -27,10 +28,11 @@ function shown(v) {
   document.body.dataset.state = v.state === "READY" ? "DONE" : "RUNNING";
   say("title", v.title);
   say("arm", v.arm === v.sensor ? v.arm : v.arm + ", " + v.sensor);
-  say("state", v.state);
-  const bad = v.problem || (one && one.refused) || "";
+  const bad = v.problem || (one && one.refused) || "", good = v.error_mm !== null && v.error_mm <= v.required_mm && !v.used;
+  say("state", bad && !busy ? "NOT TAKEN" : v.state);
+  if (bad && !busy) document.body.dataset.state = "HELD";
   el("line").className = bad ? "bad" : "";
-  say("line", bad || (one && !busy ? "Taken: " + (v.used ? "check " : "") + one.id + "." : v.state === "TAKING" && v.waits ? "Scan now: a new file is waited for." : busy ? "" : v.used ? "Written to " + v.result + ". Capture elsewhere: it judges the result." : "Bring the arm into a new pose, and capture."));
+  say("line", bad || (one && !busy ? "Taken: " + (v.used ? "check " : "") + one.id + "." + (good ? " The error is as low as is wanted: press Use it." : "") : v.state === "TAKING" && v.waits ? "Scan now: a new file is waited for." : busy ? "" : v.used ? "Written to " + v.result + ". Capture elsewhere: it judges the result." : "Bring the arm into a new pose, and capture."));
   show("typed", v.typed);
   show("auto", !v.typed);
   el("by_itself").checked = v.by_itself;
@@ -49,8 +51,8 @@ function shown(v) {
   say("count", String(v.captures.length));
   list("captures", v.captures.map(c => [c.id + (c.odd ? ": " + c.odd : ""), !!c.odd]), v.used ? null : k => ask("back-" + v.captures[k].id));
   show("checking", v.used);
-  list("checks", v.checks.map(c => [c.error_mm.toFixed(3) + " mm", c.error_mm > v.required_mm]));
-  say("folder", v.folder);
+  list("checks", v.checks.map(c => [c.error_mm.toFixed(3) + " mm, wanted " + v.required_mm.toFixed(2), c.error_mm > v.required_mm]));
+  say("folder", v.used ? v.result : v.folder);
   say("command", v.command);
   if (v.jogs.length && !el("jogs").children.length) {
     for (const name of v.jogs) {
@@ -59,10 +61,12 @@ function shown(v) {
       el("jogs").append(b);
     }
     const go = document.createElement("button");
-    go.type = "button"; go.id = "go"; el("jogs").title = "steps of 50 mm and 15 deg"; go.textContent = "to the next pose"; go.style.gridColumn = "1 / -1"; go.addEventListener("click", () => ask("jog-next"));
+    go.type = "button"; go.id = "go"; go.textContent = "to the next pose"; go.style.gridColumn = "1 / -1"; go.addEventListener("click", () => ask("jog-next"));
     el("jogs").append(go);
   }
   show("jogs", v.jogs.length > 0);
+  show("steps", v.jogs.length > 0);
+  if (el("go")) el("go").disabled = busy || !v.advice;
   last = v;
 }
 
