@@ -106,6 +106,15 @@ class Run(Generic[JobOf]):
         """Whether the operator ended the run: with Ctrl-C, on the dashboard or in the 3D view."""
         return self.held and (self.cell.operator.ends or (self.interrupted or "").startswith(STOPPED_BY_OPERATOR))
 
+    def raise_if_interrupted(self) -> None:
+        """For a study of many runs, which an operator ends with any one of them.
+
+        Raises:
+            KeyboardInterrupt: an operator ended this run.
+        """
+        if self.interrupted is not None:
+            raise KeyboardInterrupt(self.interrupted)
+
     def real_time_factor(self, phase: str | None = None) -> float:
         """Simulated seconds per wall second of the whole run, or of one phase."""
         if phase is None:

@@ -52,7 +52,7 @@ class CarriedTask:
 
     def __init__(self, header: DatasetHeader, scene: MountingScene, circle: Circle, plan: MountingPlan) -> None:
         if scene.two:
-            raise InputError("Capture has the pose of one arm. Two are calibrated by: weldcal calibrate --scenario NAME")
+            raise InputError("Capture has the pose of one arm. Calibrate two by: weldcal calibrate --scenario NAME")
         self._header, self.scene, self._circle, self._plan = header, scene, circle, plan
         self.symbol, self.least = scene.mounting.unknowns["X"].symbol, fewest(scene)
         self._found: CarriedCalibration | None = None

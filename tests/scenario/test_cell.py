@@ -362,7 +362,8 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert closed
     assert found.held
     assert found.reason == "The operator stopped the run with Ctrl-C, in the phase 'approach_above'."
-    assert found.interrupted is not None
+    with pytest.raises(KeyboardInterrupt, match="in the phase 'approach_above'"):
+        found.raise_if_interrupted()  # a study of many runs ends with it
     result = measure(found, RunOptions(scenario="a test's own", out=tmp_path / "run", recording=False))
     write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"

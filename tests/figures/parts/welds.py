@@ -23,8 +23,7 @@ def part_welds(run: Run) -> None:
         cell = write_cell(part, run.out / name, trial)
         options = RunOptions(scenario=str(cell), out=run.out / name / "weld", seed=run.seed, recording=False)
         result = run_scenario(trial.scenario(cell), options, run.progress)
-        if result.run.interrupted is not None:
-            raise KeyboardInterrupt(result.run.interrupted)
+        result.run.raise_if_interrupted()
         found = result.summary()
         numbers = (fixed(float(str(found.get(key, "nan"))), 3) for key in COLUMNS)
         rows.append((name, part.joint, str(found["state"]), *numbers, str(found.get("reason") or "")))

@@ -93,8 +93,7 @@ def run_job(
         before = controller.ask(check="summary")
         with _thrown(world, happening, stage, thrown):
             result = run_scenario(scenario, RunOptions(scenario="wired", out=folder, seed=seed, recording=False), watch)
-        if result.run.interrupted is not None:
-            raise KeyboardInterrupt(result.run.interrupted)
+        result.run.raise_if_interrupted()
         ended = time.monotonic()
         held = result.state != "done"
         if held:

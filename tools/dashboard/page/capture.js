@@ -66,6 +66,7 @@ function shown(v) {
   }
   show("jogs", v.jogs.length > 0);
   show("steps", v.jogs.length > 0);
+  if (v.jogs.length) say("steps", v.jogs[0].includes("J") ? "Steps of 15 deg." : "Steps of 50 mm and 15 deg, along and about the base's axes.");
   if (el("go")) el("go").disabled = busy || !v.advice;
   last = v;
 }
