@@ -95,12 +95,10 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
     """
     path = Path(path)
     if path.is_dir():
-        inside = [path / name for name in (HAND_EYE_FILE, CALIBRATION_FILE, PROFILER_FILE) if (path / name).is_file()]
+        files = (HAND_EYE_FILE, CALIBRATION_FILE, PROFILER_FILE)
+        inside = [path / name for name in files if (path / name).is_file()]
         if not inside:
-            raise DatasetError(
-                f"'{path.name}' holds neither {HAND_EYE_FILE} nor {CALIBRATION_FILE} nor {PROFILER_FILE}; name the file of"
-                " the result."
-            )
+            raise DatasetError(f"'{path.name}' holds none of {', '.join(files)}; name the file of the result.")
         path = inside[0]
     try:
         lists, own = _contents(path)
