@@ -22,13 +22,14 @@ from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.results import RESULT_FILE as CALIBRATION_FILE
 from weldcal.calibration.data.results import pose_of_document
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_from_document
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import DocumentSection
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
-HAND_EYE_FILE = "hand_eye.yaml"
+HAND_EYE_FILE, PROFILER_FILE = "hand_eye.yaml", "profiler.yaml"
 SYMBOLS = {"eye_in_hand": "X_FC", "eye_on_base": "X_BC"}
 """The camera's pose by the mounting."""
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -44,7 +45,21 @@ _CAMERA_LINK = re.compile(r"(?i)(cam|scanner|sensor|optical|eye|zivid|realsense|
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StatedPose:
+class _Own:
+    """What a file says of its pose beside the pose itself, as StatedPose explains it."""
+
+    mounting: str | None = None
+    covariance: Array | None = None
+    data: frozenset[str] = frozenset()
+    symbol: str = ""
+    freedom: float = np.inf
+    correction: ScannerCorrection | None = None
+    joint: Array | None = None
+    work_C: Array | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StatedPose(_Own):
     """The pose of a calibrated camera as a file states it.
 
     Attributes:
@@ -55,25 +70,17 @@ class StatedPose:
         mounting: the mounting that the file names, or None.
         covariance: (6, 6) [rotation rad; translation m] on the parent's side about the camera's origin, where the file
             states it.
-        data: SHA-256 of the data that the file names as its source.
+        data: SHA-256 of the scans or pairs that the file names as its source.
+        symbol: X_BC, X_FC or X_FS of a result of weldcal; empty for others.
+        freedom: residuals that the covariance was estimated from; infinite where the file allows for them or has none.
+        correction: of a scanner's points; joint (6 + K, 6 + K): covariance of pose and correction.
+        work_C: middle (3,) m of what the scans show, in the camera's frame.
     """
 
     name: str
     form: str
     readings: tuple[PoseReading, ...]
     unit: str
-    mounting: str | None = None
-    covariance: Array | None = None
-    data: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Own:
-    """What a file says of its pose beside the pose itself."""
-
-    mounting: str | None = None
-    covariance: Array | None = None
-    data: frozenset[str] = frozenset()
 
 
 def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
@@ -88,11 +95,10 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
     """
     path = Path(path)
     if path.is_dir():
-        inside = [path / name for name in (HAND_EYE_FILE, CALIBRATION_FILE) if (path / name).is_file()]
+        files = (HAND_EYE_FILE, CALIBRATION_FILE, PROFILER_FILE)
+        inside = [path / name for name in files if (path / name).is_file()]
         if not inside:
-            raise DatasetError(
-                f"'{path.name}' holds neither {HAND_EYE_FILE} nor {CALIBRATION_FILE}; name the file of the result."
-            )
+            raise DatasetError(f"'{path.name}' holds none of {', '.join(files)}; name the file of the result.")
         path = inside[0]
     try:
         lists, own = _contents(path)
@@ -118,9 +124,7 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
         form=one.form.replace("4 x 4 matrices", "a 4 x 4 matrix") or "a pose",
         readings=tuple(readings),
         unit=unit,
-        mounting=own.mounting,
-        covariance=own.covariance,
-        data=own.data,
+        **vars(own),
     )
 
 
@@ -189,7 +193,7 @@ def _of_tree(tree: Any, name: str) -> tuple[list[Listing], _Own]:
 
 
 def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own] | None:
-    """The camera's pose in weldcal's files: hand_eye.yaml or .json, calibration.yaml, X_BC.json and what --json prints.
+    """The sensor's pose in weldcal's files: hand_eye, calibration or profiler.yaml, X_BC.json and what --json prints.
 
     None for others.
     """
@@ -204,10 +208,12 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         data = tree.get("data")
         sha = [data.get("sha256")] if isinstance(data, Mapping) else []
     else:
-        symbol = next((key for key in ("X_BC", "X_FC", "X") if key in tree), "")
+        symbol = next((key for key in ("X_BC", "X_FC", "X_FS", "X") if key in tree), "")
         found = tree.get(symbol)
         hashes = tree.get("data_sha256")
-        sha = list(hashes.values()) if isinstance(hashes, Mapping) else []
+        # two datasets may have one header and one list of poses
+        named = hashes if isinstance(hashes, Mapping) else {"": hashes}
+        sha = [value for name_of, value in named.items() if name_of not in ("dataset.yaml", "poses.csv")]
         mounting = mounting or {symbol: name for name, symbol in SYMBOLS.items()}.get(symbol)
     covariance = tree.get("covariance", tree.get("covariance_X", tree.get("covariance_rotation_translation")))
     if isinstance(found, Mapping):
@@ -217,15 +223,30 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         found = found.get("matrix")
     if found is None:
         return None
-    if isinstance(covariance, Mapping):
-        covariance = covariance.get("matrix")
     matrix = _array(found, (4, 4))
     if matrix is None:
         return None
     listing = replace(listing_of_array(f"{name}, {symbol}", matrix), unit="m", form="a 4 x 4 matrix of weldcal")
+    freedom, observed, joint = tree.get("degrees_of_freedom"), tree.get("observed"), None
+    correction = correction_from_document(tree.get("scanner_correction"), name)
+    if correction is not None:
+        joint = _array(_matrix(tree.get("joint_covariance")), (6 + TERMS[correction.order],) * 2)
+    seen = observed.get("camera") if isinstance(observed, Mapping) else None
+    points = _array(seen, (len(seen), 3)) if isinstance(seen, list) and seen else None
     return [listing], _Own(
-        mounting=mounting, covariance=_array(covariance, (6, 6)), data=frozenset(str(one) for one in sha if one)
+        mounting=mounting,
+        covariance=_array(_matrix(covariance), (6, 6)),
+        data=frozenset(str(one) for one in sha if one),
+        symbol=SYMBOLS.get(mounting or "", symbol),
+        freedom=float(freedom) if isinstance(freedom, int | float) else np.inf,
+        correction=correction,
+        joint=joint,
+        work_C=None if points is None else points.mean(axis=0),
     )
+
+
+def _matrix(value: Any) -> Any:
+    return value.get("matrix") if isinstance(value, Mapping) else value
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> Array | None:

@@ -69,6 +69,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
     only_look = (
         "weldcal view",
         "weldcal replay",
+        "weldcal compare",
         "weldcal doctor",
         "weldcal check-robot",
         "weldcal finger loading",
@@ -96,7 +97,7 @@ def test_a_shell_completes_names_without_a_heavy_import() -> None:
     environment = os.environ | {"_WELDCAL_COMPLETE": "complete_bash", "COMP_WORDS": "weldcal c", "COMP_CWORD": "1"}
     done = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["capture", "calibrate", "camera", "check-robot", "check-cell"]
+    assert done.stdout.split() == ["capture", "calibrate", "compare", "camera", "check-robot", "check-cell"]
 
 
 def test_help_and_a_mistyped_path_load_no_heavy_library() -> None:

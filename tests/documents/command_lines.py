@@ -27,6 +27,7 @@ CHEAP = (
         "tool measure",
         "print-board",
         "verify",
+        "compare",
         "apply",
         "export",
         "profiler edge",

@@ -22,6 +22,7 @@ COMMANDS = {
     "carried": ("`calibrate FOLDER` of a scanner that an arm carries", "calibrate my_wrist_scans --out carried"),
     "verify": ("`verify RESULT FOLDER`", "verify my-calibration other_scans"),
     "verify pairs": ("`verify RESULT PAIRS`", "verify eMc.yaml pairs.npz"),
+    "compare": ("`compare RESULT RESULT`", "compare my-calibration my-calibration"),
     "import": ("`import`", "import samples.npz"),
     "hand-eye": ("`hand-eye`", "hand-eye ax-yb samples.npz"),
     "two robots": ("`hand-eye`", "hand-eye axb-ycz two_robots.npz"),

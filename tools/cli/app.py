@@ -28,7 +28,18 @@ DEFAULTS = {"hand-eye": "ax-yb"}
 
 PANELS = {
     "Calibrate": (
-        *("capture", "calibrate", "verify", "apply", "camera", "hand-eye", "profiler", "tablet", "plan-poses"),
+        *(
+            "capture",
+            "calibrate",
+            "verify",
+            "compare",
+            "apply",
+            "camera",
+            "hand-eye",
+            "profiler",
+            "tablet",
+            "plan-poses",
+        ),
         *("doctor", "monitor", "fleet"),
     ),
     "Weld": ("demo", "weld", "plan-passes", "part", "new", "finger", "tool"),

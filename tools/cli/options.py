@@ -381,7 +381,7 @@ def _emit_first(title: str, first: "FirstScreen", written: Path | None) -> None:
     for size in first.sizes:
         rows = first.brief(*size) | {"report": files}
         last = size == first.sizes[-1]
-        if console.emit_summary(f"{title}: {first.verdict}", rows, most=None if last else MOST_LINES):
+        if console.emit_summary(f"{title}: {first.named}", rows, most=None if last else MOST_LINES):
             return
 
 
@@ -430,7 +430,7 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     if problem is None and state != "done":
         problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")
     if not problem and first is not None:
-        problem = first.refusal if call.json or not first.refusal else f"The verdict is: {first.verdict}."
+        problem = first.refusal if call.json or not first.refusal else f"The verdict is: {first.named}."
     if problem:
         console.emit_warning(problem)
         raise typer.Exit(1)

@@ -219,7 +219,8 @@ class Findings:
             poses.
         concerns: what could be wrong; any of them leaves the verdict at "use with care".
         notes: what a reader should know; they do not change the verdict.
-        settled: verdict and reason of a command that has a rule of its own (`verify`).
+        settled: verdict and reason of a command that has a rule of its own (`verify`, `compare`).
+        words: what the command calls this verdict; empty: as it is.
     """
 
     against: Sequence[str] = ()
@@ -229,6 +230,7 @@ class Findings:
     concerns: Sequence[str] = ()
     notes: Sequence[str] = ()
     settled: tuple[str, str] | None = None
+    words: str = ""
 
 
 def decide(found: Findings) -> tuple[str, str]:
@@ -280,6 +282,11 @@ class FirstScreen:
         return decide(self.found)[0]
 
     @property
+    def named(self) -> str:
+        """The verdict in the command's own words."""
+        return self.found.words or self.verdict
+
+    @property
     def reason(self) -> str:
         """Why, in a sentence or two."""
         return f"{self.lead} {decide(self.found)[1]}".strip()
@@ -292,7 +299,7 @@ class FirstScreen:
     @property
     def refusal(self) -> str:
         """Return the sentence that ends a command with exit code 1; empty unless the result is not to be used."""
-        return f"The verdict is: {DO_NOT}. {self.reason}" if self.verdict == DO_NOT else ""
+        return f"The verdict is: {self.named}. {self.reason}" if self.verdict == DO_NOT else ""
 
     @property
     def next(self) -> Next:
@@ -320,7 +327,7 @@ class FirstScreen:
     def rows(self) -> dict[str, str]:
         """Return the rows for the terminal, by name; several things stand on lines of their own."""
         rows = {
-            "verdict": f"{self.verdict}. {self.reason}",
+            "verdict": f"{self.named}. {self.reason}",
             self.expected.what: f"{self.expected.figure} ({self.expected.backing})",
             "could be wrong": "\n".join(f"- {text}" for text in self.concerns) or self.nothing,
             **({"good to know": "\n".join(f"- {text}" for text in self.notes)} if self.notes else {}),
