@@ -226,7 +226,7 @@ def test_a_result_is_judged_on_pictures_of_a_board(tmp_path: Path) -> None:
     """Rendered pictures: the true pose is used; one that is 6 mm off is not, and the command that solves anew runs as
     printed."""
     drawing = draw.draw_chessboard(9, 6, 20)
-    world = draw.world(drawing, 7, 12)
+    world = draw.world(drawing, 7, 20)
     shots = tmp_path / "shots"
     draw.write_pictures(shots, drawing, world, 7, sub=2)
     draw.write_robot(shots / "robot.csv", world.robot)
