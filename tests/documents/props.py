@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import yaml
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
@@ -20,6 +21,7 @@ from tests.documents.scans import write_scans, write_wrist_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
 from tests.worlds.touch import touch_world
+from weldcal.calibration.data.camera_file import CameraFile, camera_document
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.touch.touches import touches_text
@@ -75,6 +77,14 @@ def _pictures(path: Path) -> None:
     found = rendering.world(drawing, 5, 12)
     rendering.write_pictures(path, drawing, found, 5, sub=2)
     rendering.write_robot(path / "poses.txt", found.robot)
+
+
+def _camera(path: Path) -> None:
+    """The camera of those pictures, as weldcal camera writes it."""
+    of = np.diag([1.0] * 4 + [1e-4] * 4 + [0.0])
+    true = CameraFile(rendering.K, np.append(rendering.DIST, 0.0), rendering.SIZE, covariance=of)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(yaml.safe_dump(camera_document(true), sort_keys=False), encoding="utf-8")
 
 
 def _two_robots(path: Path) -> None:
@@ -207,6 +217,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "pairs.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "eMc.yaml": _camera_pose,
     "my_pictures": _pictures,
+    "my_camera/camera.yaml": _camera,
     "samples.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,
