@@ -85,8 +85,8 @@ class CarriedTask:
                     " it: the pose or the scan is an older one, a TCP is set at the robot, or the mounting_guess is"
                     " wrong."
                 )
-            doubt = " If it is there, the pose is an older one, or not the flange's." if self._seen else ""
-            return None, f"{error} Bring it whole into the scanner's view.{doubt}"
+            else_ = " If it is there, the pose is an older one, or not the flange's." if self._seen else ""
+            return None, f"{error} Bring it whole into the scanner's view.{else_}"
         self._seen[id] = one
         return one.fit, ""
 
@@ -158,8 +158,8 @@ class CarriedTask:
             return []
         arm = self.scene.arm_error_m
         return [
-            f"The last {_SETTLED_AFTER - 1} captures hardly lowered the error: it comes from the arm, whose flange is"
-            f" off by {1e3 * arm:.1f} mm (rms; arm_error_mm in dataset.yaml), not from the number of captures."
+            f"The last {_SETTLED_AFTER - 1} captures hardly lowered the error. Most of it is then the arm's: its flange"
+            f" is taken to be off by {1e3 * arm:.1f} mm (rms; arm_error_mm in dataset.yaml)."
         ]
 
     def command(self, folder: Path) -> str:

@@ -6,6 +6,7 @@ The scans are cast at the drawn arm; the scanner's true pose on it is not known 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.capture.carried import CarriedTask
 from weldcal.calibration.capture.session import ArmPose, CaptureSession
-from weldcal.calibration.recorded_carried import calibrate_carried
+from weldcal.calibration.recorded_carried import CarriedCalibration, calibrate_carried
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.mounting.job import mounting_plan, mounting_scene
@@ -103,3 +104,12 @@ def test_an_arm_link_needs_joint_angles(tmp_path: Path) -> None:
 def test_two_arms_are_refused_with_the_command_that_does_it() -> None:
     with pytest.raises(InputError, match="weldcal calibrate --scenario NAME"):
         carried("co_manipulation")
+
+
+def test_what_more_captures_cannot_lower_is_named() -> None:
+    """Errors of a session on the forearm, which settled, and of one that still falls."""
+    task = carried("eye_on_arm")
+    settled = CarriedCalibration(history=((4, 2.6e-4), (5, 2.58e-4), (6, 2.58e-4), (7, 2.55e-4)))
+    assert "taken to be off by 0.4 mm" in " ".join(task._floor(settled))
+    assert not task._floor(replace(settled, history=((4, 3.2e-4), (5, 2.5e-4), (6, 2.2e-4), (7, 2.1e-4))))
+    assert not task._floor(replace(settled, history=settled.history[:3])), "three are too few to tell"
