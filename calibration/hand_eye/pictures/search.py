@@ -100,7 +100,7 @@ def picture_files(folder: Path, named: str | None = None) -> list[Path]:
     wanted = [g for g in groups.values() if named is not None or not _OTHER.search(g[0].relative_to(folder).as_posix())]
     if not wanted:
         raise DatasetError(
-            f"'{folder.name}' holds no pictures ({', '.join(ENDINGS)}); put them beside the robot's poses."
+            f"'{folder.resolve().name}' holds no pictures ({', '.join(ENDINGS)}): name the folder that holds them."
         )
     by_place: dict[tuple[Path, str], list[list[Path]]] = {}
     for (parent, stem, _), files in groups.items():

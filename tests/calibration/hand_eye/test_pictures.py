@@ -469,3 +469,11 @@ def test_a_folder_without_robot_poses_says_what_to_add(chess: tuple[Path, draw.W
         read_pictures(
             tmp_path / "shots", parse_board("chessboard:9x6:20"), mounting="eye_in_hand", stated=StatedForms()
         )
+
+
+def test_a_folder_without_pictures_is_named_where_it_is_given_as_a_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DatasetError, match=f"'{tmp_path.name}' holds no pictures .*: name the folder that holds them"):
+        picture_files(Path("."))
