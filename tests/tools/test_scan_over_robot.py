@@ -310,6 +310,7 @@ def test_the_command_writes_a_page_and_a_picture(
     [
         ("no_scan", "has no scan 'b': it has a."),
         ("no_result", "There is no calibration in '"),
+        ("no_folder", "There is no file or folder '"),
         (
             "no_joints",
             "The scans have no joint angles (q1, q2 ...), by which --robot places the links: add them, or omit --robot.",
@@ -332,7 +333,11 @@ def test_a_mistake_is_one_sentence(
     shutil.copytree(folder / "mine", tmp_path / "mine")
     data, robot = folder / "data", ["--robot", urdf(tmp_path)]
     X = moved(5.0, 0.0, 0.0) @ X_BC if change == "elsewhere" else X_BC
-    result = tmp_path / "result" if change == "no_result" else write_result(tmp_path / "result", X)
+    result = tmp_path / "result"
+    if change == "no_result":
+        result.mkdir()
+    elif change != "no_folder":
+        write_result(result, X)
     if change == "no_joints":
         data = write_scan(tmp_path / "data", cast(X_BC, 40)[0], q=np.array([]))
     if change == "other_joints":

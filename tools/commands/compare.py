@@ -16,7 +16,7 @@ ResultArgument = Annotated[
 ]
 
 
-@command("compare", common=(*LOOK, "verbose"), short_help="Are two results the same within their regions?")
+@command("compare", common=(*LOOK, "verbose"), short_help="Say whether two results are the same within their regions.")
 def compare(call: Call, first: ResultArgument, second: ResultArgument) -> Outcome:
     """Compare two results of one mounting that have no data in common: the difference, its squared Mahalanobis distance
     with the 95 % limit, and the direction that differs most. The exit code is 1 where they differ."""

@@ -83,6 +83,7 @@ class CommandThread(threading.Thread):
         self.process = False
         self.state: LinkState = link.state()
         self.worst_gap_s = 0.0
+        self.gap_s = 0.0  # the longest since this was last set to zero
 
     def run(self) -> None:
         with real_time_priority():  # as a cell
@@ -93,7 +94,7 @@ class CommandThread(threading.Thread):
         while not self._done.is_set():
             time.sleep(max(0.0, deadline - time.monotonic()))
             now = time.monotonic()
-            self.worst_gap_s = max(self.worst_gap_s, now - last)
+            self.worst_gap_s, self.gap_s = max(self.worst_gap_s, now - last), max(self.gap_s, now - last)
             last, deadline = now, max(deadline + 1.0 / RATE_HZ, now)
             self.state = self._link.state()
             qd = self.twist(self._stroke.next(self.state.q, 1.0 / RATE_HZ))

@@ -13,6 +13,7 @@ from weldcal.systems.drivers.ur.link import LinkState, UrLink
 
 STEP_RAD_S = 0.2
 STEP_JOINT = 5
+APART_S = 0.45  # from one step to the next: steps come every 0.5 s, a late clock makes up for at most 20 ms
 
 
 @dataclass(kw_only=True)
@@ -32,6 +33,7 @@ class Tap:
     _heard: float = -1.0
     _wanted: float = 0.0
     _stepped: tuple[float, float, float] | None = None  # when, from, to
+    _changed: float = -np.inf  # when the last step was
 
     def restart(self, link: UrLink) -> None:
         """Go on with another link."""
@@ -69,8 +71,9 @@ class Tap:
         """As the link's."""
         number, now = self.link.command(qd, process), time.monotonic()
         self.command_times.append(now)
-        # a late computer slows the path: its small changes are no steps
-        if abs(qd[STEP_JOINT] - self._wanted) > 0.5 * STEP_RAD_S:
+        # a late computer slows the path for a while: neither its small changes nor a short dip are steps
+        if abs(qd[STEP_JOINT] - self._wanted) > 0.5 * STEP_RAD_S and now > self._changed + APART_S:
+            self._changed = now
             self._stepped = (now, self._wanted, float(qd[STEP_JOINT]))
             self._wanted = float(qd[STEP_JOINT])
         return number
