@@ -196,6 +196,8 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
     Raises:
         InputError, WeldcalError: as ``calibrate_recorded`` for each, and ``solve_together``.
     """
+    if len({file.resolve() for file in files}) < len(files):
+        raise InputError("A file is given twice: give the file of each sensor once.")
     names = sensor_names(files)
     each = []
     for file, name in zip(files, names, strict=True):
@@ -206,7 +208,7 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
             raise InputError(f"{text} Each of several files holds the pairs of one sensor.") from problem
     mountings = sorted({found.mounting.name for found in each})
     if len(mountings) > 1:
-        raise InputError(f"The files are of the mountings {' and '.join(mountings)}: solve each mounting by itself.")
+        raise InputError(f"The files are of the mountings {' and '.join(mountings)}: solve each by itself.")
     if open_ := [name for name, found in zip(names, each, strict=True) if found.result.unobservable]:
         raise InputError(f"The poses of '{open_[0]}' leave a direction open: add poses, or omit this file.")
     plain = asked.corners is False

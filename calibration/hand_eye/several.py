@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
@@ -21,9 +22,10 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
 _ROUNDS, _SETTLED = 10, 1e-3  # linearisations at most; steps in sigmas that change no answer
-_LOG_LEAST, _LOG_MOST = -16.0, -1.0  # of a standard deviation, rad or m: below any sensor, above any calibration
+_LEAST, _MOST, _MOST_PX = 1e-6, 0.4, 20.0  # of a standard deviation, rad, m and px: beyond those of any calibration
 _LOOSE = 1e-3  # information of the logarithm of a standard deviation about its start: only bounds what is open
 _DIFFERENT = 4.0  # a choice: so many times its own noise a sensor leaves beside the others where the targets differ
+_START_PX = 0.2  # of a corner, where the search for its size begins
 _STEP_PX = 0.5  # of the difference that shows what the principal point moves
 
 SharedError = tuple[float, float]
@@ -50,6 +52,8 @@ class SensorsTogether:
         covariance: of X and Y (6 N + 6, 6 N + 6), each as (exp(a) R, p + b).
         noise: (N, 2) rad and m, per axis, of each sensor's own errors.
         common: rad and m, per axis, of the errors at a robot pose that all sensors share: the robot's.
+        sizes: (N + 1, 2) the standard deviations of the model: the robot's rad and m, then each sensor's rad and m; of
+            cameras with corners px and m.
         shift_px: (N, 2) shift of the principal point of cameras with corners; NaN without.
         poses: distinct robot poses (N,) of each sensor.
         shared: distinct robot poses that more than one sensor measured.
@@ -63,6 +67,7 @@ class SensorsTogether:
     covariance: Array
     noise: Array
     common: SharedError
+    sizes: Array
     shift_px: Array
     poses: NDArray[np.int64]
     shared: int
@@ -82,14 +87,18 @@ class SensorsTogether:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Rows:
-    """Observations of all sensors: numbers (n,) of the sensor, of its sample, and of the robot pose among all."""
+    """Observations of all sensors: numbers (n,) of the sensor, of its sample, and of the robot pose among all.
+
+    ``shape`` (n, 2, 6, 6): covariances of its own error in units of the two variances of the sensor.
+    """
 
     sensor: NDArray[np.int64]
     sample: NDArray[np.int64]
     place: NDArray[np.int64]
+    shape: Array
 
     def pick(self, rows: NDArray[np.bool_]) -> "_Rows":
-        return _Rows(sensor=self.sensor[rows], sample=self.sample[rows], place=self.place[rows])
+        return _Rows(sensor=self.sensor[rows], sample=self.sample[rows], place=self.place[rows], shape=self.shape[rows])
 
     @property
     def groups(self) -> list[NDArray[np.int64]]:
@@ -108,7 +117,8 @@ def solve_together(sensors: Sequence[Sensor], config: HandEyeConfig | None = Non
     """Solve F_i X_k G_ki = Y for the poses X_k of all sensors k and that of their one target.
 
     At a robot pose all sensors share one error of the robot, and each has its own, normal with one standard deviation
-    for rotations and one for displacements of the target's middle. The standard deviations follow from the restricted
+    for rotations and one for displacements of the target's middle. Where a camera's corners are given, an error of each
+    corner takes the place of the rotations. The standard deviations follow from the restricted
     likelihood. Camera to camera is thus as good as the sensors are, however bad the robot. Cameras with corners have an
     unknown shift of the principal point, with the standard deviation USUAL_DISCORD_RAD; the covariance of others holds
     the discord of their own solution. Observations that a sensor's own solution excluded are not used.
@@ -117,18 +127,19 @@ def solve_together(sensors: Sequence[Sensor], config: HandEyeConfig | None = Non
         InconsistentPoses: one of the sensors saw another target.
     """
     pairs, places = _per_pose(sensors)
+    work = _Joint(sensors, pairs)
     rows = _Rows(
         sensor=np.repeat(np.arange(len(pairs)), [len(p) for p in places]),
         sample=np.concatenate([np.arange(len(p)) for p in places]),
         place=np.concatenate(places),
+        shape=np.concatenate([work.shape(k) for k in range(len(pairs))]),
     )
-    work = _Joint(sensors, pairs)
     start = int(np.argmin([s.result.sigma_translation for s in sensors]))
     found = work.solved(rows, work.start(start))
     sizes = np.hypot(found.noise, np.asarray(found.common))
     own = np.array([[s.result.sigma_rotation_rad, s.result.sigma_translation] for s in sensors])
-    worse = (sizes / np.maximum(own, 1e-9)).max(axis=1)  # 1e-9 rad or m: exact data
-    if float(worse.max()) > _DIFFERENT and float(found.noise[:, 1].max()) > 1e-6:
+    worse = (sizes / np.maximum(own, 2.0 * _LEAST)).max(axis=1)
+    if float(worse.max()) > _DIFFERENT:
         k = int(np.argmax(worse))
         raise InconsistentPoses(
             f"'{sensors[k].name}' and the other sensors do not show one target: beside them its poses scatter"
@@ -192,6 +203,8 @@ class _Joint:
         self.at_shift = self.core + 2 * (np.cumsum(self.corners) - 1)
         self.size = self.core + 2 * int(self.corners.sum())
         self.centre = np.asarray(np.mean([s.result.noise_centre for s in sensors], axis=0))
+        self.most = np.full((n + 1, 2), _MOST)
+        self.most[1:, 0] = np.where(self.corners, _MOST_PX, _MOST)
         self.sigma_px = [USUAL_DISCORD_RAD * (1.0 if p.K is None else float(p.K[0, 0])) for p in pairs]
 
     def start(self, k: int) -> _At:
@@ -199,8 +212,31 @@ class _Joint:
         results = [s.result for s in self.sensors]
         X = np.array([np.asarray(r.X.GetAsMatrix4()) for r in results])
         own = np.array([[r.sigma_rotation_rad, r.sigma_translation] for r in results])
-        logs = np.log(np.maximum(np.vstack([0.5 * own.min(axis=0), own]), np.exp(_LOG_LEAST + 1.0)))
+        logs = np.log(np.maximum(np.vstack([0.5 * own.min(axis=0), own]), 2.0 * _LEAST))
+        logs[1:, 0] = np.where(self.corners, np.log(_START_PX), logs[1:, 0])
         return _At(X, np.asarray(results[k].Y.GetAsMatrix4()), np.zeros((len(X), 2)), logs.ravel())
+
+    def shape(self, k: int) -> Array:
+        """Covariances (n, 2, 6, 6) of the errors of sensor ``k``, in units of its two variances.
+
+        Of rotations and of displacements alike in all directions; with corners, what a pixel's error in each corner
+        does to the board's pose takes the place of the former.
+        """
+        p = self.pairs[k]
+        out = np.zeros((len(p.robot), 2, 6, 6))
+        out[:, 0, :3, :3] = out[:, 1, 3:, 3:] = np.eye(3)
+        if self.corners[k]:
+            assert p.img is not None
+            assert p.obj is not None
+            dist = np.zeros(5) if p.dist is None else p.dist
+            for i, X in enumerate(poses_from_corners(p, np.zeros(2))):
+                seen = np.isfinite(p.img[i]).all(axis=1)
+                arm = p.obj[seen] - self.centre
+                _, jac = cv2.projectPoints(p.obj[seen], cv2.Rodrigues(X[:3, :3])[0], X[:3, 3], p.K, dist)
+                by_point = np.asarray(jac, dtype=float).reshape(len(arm), 2, -1)[:, :, 3:6] @ X[:3, :3]
+                J = np.concatenate([-by_point @ skew(arm), by_point], axis=2).reshape(-1, 6)
+                out[i, 0] = np.linalg.inv(J.T @ J)
+        return out
 
     def measured(self, k: int, shift: Array) -> Problem:
         """The equation of sensor ``k`` with its principal point shifted."""
@@ -248,7 +284,7 @@ class _Joint:
             e, J, turned = self.lines(rows, at)
             information, off = self.prior(at)
             total = partial(_summed, rows, groups, e, J, information, off)
-            logs = _likeliest(total, at.logs, begin, common=shared > 1)
+            logs = _likeliest(total, at.logs, begin, self.most.ravel(), common=shared > 1)
             N, b, *_ = total(np.exp(logs))
             S = np.asarray(np.linalg.inv(N), dtype=float)
             step = -S @ b
@@ -265,12 +301,15 @@ class _Joint:
             pulled = S @ _pulled(rows, groups, np.exp(logs), J, by)
             S = S + self.sensors[int(k)].result.discord_rad ** 2 * pulled @ pulled.T
         sizes = np.exp(at.logs).reshape(-1, 2)
+        mean = np.einsum("nv,nvii->ni", sizes[1 + rows.sensor] ** 2, rows.shape)
+        noise = np.array([mean[rows.sensor == k].mean(axis=0).reshape(2, 3).mean(axis=1) for k in range(n)])
         return SensorsTogether(
             names=tuple(s.name for s in self.sensors),
             X=at.X,
             Y=at.Y,
             covariance=S[: self.core, : self.core],
-            noise=sizes[1:],
+            noise=np.sqrt(noise),
+            sizes=sizes,
             common=(float(sizes[0, 0]), float(sizes[0, 1])) if shared > 1 else (0.0, 0.0),
             shift_px=np.where(self.corners[:, None], at.shift, np.nan),
             poses=np.bincount(rows.sensor, minlength=n),
@@ -282,21 +321,22 @@ def _roots(rows: _Rows, group: NDArray[np.int64], sizes: Array) -> Array:
     """Cholesky factors (k, 6 m, 6 m) of the covariances of k groups of m observations at one pose each."""
     k, m = group.shape
     V = np.zeros((k, m, 6, m, 6))
-    common, own = np.repeat(sizes[:2], 3) ** 2, np.repeat(sizes[2:].reshape(-1, 2), 3, axis=1) ** 2
-    V[:, :, np.arange(6), :, np.arange(6)] = common[:, None, None, None]
+    variances = sizes.reshape(-1, 2) ** 2
+    V[:, :, np.arange(6), :, np.arange(6)] = np.repeat(variances[0], 3)[:, None, None, None]
     for a in range(m):
-        V[:, a, np.arange(6), a, np.arange(6)] += own[rows.sensor[group[:, a]]]
+        mine = group[:, a]
+        V[:, a, :, a, :] += np.einsum("nv,nvij->nij", variances[1 + rows.sensor[mine]], rows.shape[mine])
     return np.asarray(np.linalg.cholesky(V.reshape(k, 6 * m, 6 * m)))
 
 
 def _likeliest(
-    total: Callable[[Array], tuple[Array, Array, float, float]], logs: Array, begin: Array, *, common: bool
+    total: Callable[[Array], tuple[Array, Array, float, float]], logs: Array, begin: Array, most: Array, *, common: bool
 ) -> Array:
     """Logarithms of the standard deviations that maximise the restricted likelihood, the common ones where asked."""
     free = slice(0 if common else 2, None)
     whole = logs.copy()
     if not common:
-        whole[:2] = 2.0 * _LOG_LEAST
+        whole[:2] = -np.inf
 
     def deviance(some: Array) -> float:
         whole[free] = some
@@ -307,7 +347,7 @@ def _likeliest(
         log += 2.0 * float(np.log(np.diag(L) / unit).sum())
         return float(square - x @ x + log + _LOOSE * ((some - begin[free]) ** 2).sum())
 
-    bounds = [(_LOG_LEAST, _LOG_MOST)] * len(logs[free])
+    bounds = [(np.log(_LEAST), np.log(most)) for most in most[free]]
     whole[free] = minimize(deviance, logs[free], method="L-BFGS-B", bounds=bounds).x
     return whole
 
@@ -358,8 +398,7 @@ def _held_out(work: _Joint, rows: _Rows, config: HandEyeConfig, found: SensorsTo
     label = np.zeros(int(places.max()) + 1, dtype=np.int64)
     label[places] = fold_labels(len(places))
     squares: list[tuple[float, float]] = []
-    sizes = np.maximum(np.r_[found.common, found.noise.ravel()], np.exp(_LOG_LEAST))
-    start = _At(found.X, found.Y, np.nan_to_num(found.shift_px), np.log(sizes))
+    start = _At(found.X, found.Y, np.nan_to_num(found.shift_px), np.log(found.sizes.ravel()))
     for fold in range(5):
         out = label[rows.place] == fold
         test = rows.pick(out)
