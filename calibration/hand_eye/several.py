@@ -398,7 +398,7 @@ def _held_out(work: _Joint, rows: _Rows, config: HandEyeConfig, found: SensorsTo
     label = np.zeros(int(places.max()) + 1, dtype=np.int64)
     label[places] = fold_labels(len(places))
     squares: list[tuple[float, float]] = []
-    start = _At(found.X, found.Y, np.nan_to_num(found.shift_px), np.log(found.sizes.ravel()))
+    start = _At(found.X, found.Y, np.nan_to_num(found.shift_px), np.log(np.maximum(found.sizes, _LEAST).ravel()))
     for fold in range(5):
         out = label[rows.place] == fold
         test = rows.pick(out)
