@@ -28,7 +28,7 @@ from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_corners, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
-from weldcal.calibration.hand_eye.several import Sensor, SensorsTogether, solve_together
+from weldcal.calibration.hand_eye.several import SensorPairs, SensorsTogether, solve_together
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion import pose_streams
 from weldcal.calibration.motion.pose_streams import ClockOffset
@@ -114,7 +114,7 @@ class RecordedHandEye:
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     read_notes: tuple[str, ...] = ()
     pictures: PictureResult | None = None
-    pairs: PosePairs
+    pairs: PosePairs | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -213,8 +213,9 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
         raise InputError(f"The poses of '{open_[0]}' leave a direction open: add poses, or omit this file.")
     plain = asked.corners is False
     sensors = [
-        Sensor(name=name, pairs=replace(found.pairs, img=None) if plain else found.pairs, result=found.result)
+        SensorPairs(name=name, pairs=replace(found.pairs, img=None) if plain else found.pairs, result=found.result)
         for name, found in zip(names, each, strict=True)
+        if found.pairs is not None
     ]
     together = solve_together(sensors, HandEyeConfig(seed=asked.seed))
     n = 6 * len(each)

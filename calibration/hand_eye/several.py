@@ -1,4 +1,4 @@
-"""Solve the poses of several sensors that measure one target on one robot together, with the covariance between them."""
+"""Solve the poses of several sensors with one target on one robot together, with the covariance between them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ SharedError = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sensor:
+class SensorPairs:
     """One sensor: its pairs, and its own solution of them with X and Y free."""
 
     name: str
@@ -113,7 +113,7 @@ class _Rows:
         return int((np.bincount(self.place) > 1).sum())
 
 
-def solve_together(sensors: Sequence[Sensor], config: HandEyeConfig | None = None) -> SensorsTogether:
+def solve_together(sensors: Sequence[SensorPairs], config: HandEyeConfig | None = None) -> SensorsTogether:
     """Solve F_i X_k G_ki = Y for the poses X_k of all sensors k and that of their one target.
 
     At a robot pose all sensors share one error of the robot, and each has its own, normal with one standard deviation
@@ -149,7 +149,7 @@ def solve_together(sensors: Sequence[Sensor], config: HandEyeConfig | None = Non
     return replace(found, apart_m=apart, together_m=together)
 
 
-def _per_pose(sensors: Sequence[Sensor]) -> tuple[list[PosePairs], list[NDArray[np.int64]]]:
+def _per_pose(sensors: Sequence[SensorPairs]) -> tuple[list[PosePairs], list[NDArray[np.int64]]]:
     """Pairs of each sensor with the mean of the samples at a robot pose, and the numbers of these poses over all."""
     used = [_picked(s.pairs, s.result.inliers) for s in sensors]
     F, G, H = (np.concatenate([getattr(p, part) for p in used]) for part in "FGH")
@@ -180,7 +180,7 @@ def _picked(p: PosePairs, rows: NDArray[np.bool_] | NDArray[np.int64]) -> PosePa
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """Where the solution stands: poses, shifts (N, 2) px, and logarithms of the standard deviations (2 N + 2,)."""
+    """State of the solution: poses, shifts (N, 2) px, and logarithms of the standard deviations (2 N + 2,)."""
 
     X: Array
     Y: Array
@@ -194,7 +194,7 @@ class _Joint:
     Unknowns: X of each sensor and Y, 6 each; then 2 of each camera with corners: the shift of its principal point.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], pairs: Sequence[PosePairs]) -> None:
+    def __init__(self, sensors: Sequence[SensorPairs], pairs: Sequence[PosePairs]) -> None:
         self.sensors, self.pairs = sensors, pairs
         self.problems = [full_problem(p.F, p.G, p.H) for p in pairs]
         n = len(sensors)
@@ -228,6 +228,7 @@ class _Joint:
         if self.corners[k]:
             assert p.img is not None
             assert p.obj is not None
+            assert p.K is not None
             dist = np.zeros(5) if p.dist is None else p.dist
             for i, X in enumerate(poses_from_corners(p, np.zeros(2))):
                 seen = np.isfinite(p.img[i]).all(axis=1)

@@ -288,8 +288,8 @@ def together_screen(found: RecordedTogether, limit_mm: float | None) -> FirstScr
     if joint.shared < ENOUGH_UNSEEN:
         concerns.insert(
             0,
-            f"Only {joint.shared} robot poses are of more than one sensor, so that the poses between sensors rest on the"
-            " robot: measure with all sensors at each pose.",
+            f"Only {joint.shared} robot poses are of more than one sensor, so that the poses between sensors rest on"
+            " the robot: measure with all sensors at each pose.",
         )
     notes = [f"{name}: {text}" for name, one in parts for text in one.read_notes]
     if np.isfinite(joint.together_m):

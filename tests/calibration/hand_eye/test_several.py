@@ -18,7 +18,7 @@ from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.geometry.se3 import difference, inverse, moved
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.several import Sensor, SensorsTogether, solve_together
+from weldcal.calibration.hand_eye.several import SensorPairs, SensorsTogether, solve_together
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.tools.cli.app import build_app
 
@@ -41,7 +41,7 @@ def rig(
 def together(pairs: list[PosePairs]) -> SensorsTogether:
     config = HandEyeConfig(folds=0)
     results = [solve_problem(full_problem(p.F, p.G, p.H), config=config) for p in pairs]
-    return solve_together([Sensor(name=p.source, pairs=p, result=r) for p, r in zip(pairs, results, strict=True)])
+    return solve_together([SensorPairs(name=p.source, pairs=p, result=r) for p, r in zip(pairs, results, strict=True)])
 
 
 @pytest.mark.parametrize("corners", [False, True], ids=["poses", "corners"])

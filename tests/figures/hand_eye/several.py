@@ -17,7 +17,7 @@ from tests.figures.harness import Run, figure
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.several import Sensor, SensorsTogether, solve_together
+from weldcal.calibration.hand_eye.several import SensorPairs, SensorsTogether, solve_together
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -78,7 +78,6 @@ def made(seed: int, *, corners: bool, n: int = 15, mm: float = 0.3, px: float = 
                 robot[k].append(stated)
                 camera[k].append(M)
                 img[k].append(uv)
-    more = {"obj": GRID, "K": K, "dist": np.zeros(5)} if corners else {}
     pairs = [
         PosePairs(
             source=f"camera{k + 1}",
@@ -86,7 +85,9 @@ def made(seed: int, *, corners: bool, n: int = 15, mm: float = 0.3, px: float = 
             camera=np.array(camera[k]),
             mode="eye_on_base",
             img=np.array(img[k]) if corners else None,
-            **more,
+            obj=GRID if corners else None,
+            K=K if corners else None,
+            dist=np.zeros(5) if corners else None,
         )
         for k in range(2)
     ]
@@ -97,7 +98,7 @@ def solved(pairs: list[PosePairs]) -> tuple[SensorsTogether, SensorsTogether]:
     """Solve together, and each by itself: in the form of the former, without covariance between the sensors."""
     config = HandEyeConfig(folds=0)
     results = [solve_problem(full_problem(p.F, p.G, p.H), config=config) for p in pairs]
-    both = solve_together([Sensor(name=p.source, pairs=p, result=r) for p, r in zip(pairs, results, strict=True)])
+    both = solve_together([SensorPairs(name=p.source, pairs=p, result=r) for p, r in zip(pairs, results, strict=True)])
     X = np.array([np.asarray(r.X.GetAsMatrix4()) for r in results])
     apart = block_diag(*[r.covariance["X"] for r in results], np.zeros((6, 6)))
     return both, replace(both, X=X, covariance=apart)
