@@ -1,7 +1,7 @@
 """Calibrate a camera from a file: pairs of poses, two streams, pictures of a board, or motions."""
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ from weldcal.calibration.data.poses.listing import Listing, listing_of_array
 from weldcal.calibration.data.poses.lists import folder_lists, two_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.errors import DatasetError, InconsistentPoses, UndeterminedPoses
-from weldcal.calibration.geometry.se3 import IDENTITY, inverse
+from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, inverse
 from weldcal.calibration.hand_eye.corners import poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
@@ -28,6 +28,7 @@ from weldcal.calibration.hand_eye.pictures.search import Picture
 from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_corners, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
+from weldcal.calibration.hand_eye.several import SensorPairs, SensorsTogether, solve_together
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion import pose_streams
 from weldcal.calibration.motion.pose_streams import ClockOffset
@@ -100,7 +101,7 @@ class RecordedHandEye:
     """A calibration from a file: the result, the comparison and the next pose (``advice``).
 
     ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were
-    given.
+    given; ``pairs``: as they were solved.
     """
 
     result: HandEyeResult
@@ -113,6 +114,15 @@ class RecordedHandEye:
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     read_notes: tuple[str, ...] = ()
     pictures: PictureResult | None = None
+    pairs: PosePairs | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedTogether:
+    """Several sensors from a file each: their calibrations with the poses and covariances of the joint solution."""
+
+    each: tuple[RecordedHandEye, ...]
+    together: SensorsTogether
 
 
 @dataclass
@@ -176,7 +186,63 @@ def calibrate_recorded(
         read_notes=found.pairs.notes,
         streams=streams,
         pictures=found.pictures,
+        pairs=found.pairs,
     )
+
+
+def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = lambda _: None) -> RecordedTogether:
+    """Calibrate several sensors of one mounting, that measured one target on one robot, from a file each.
+
+    Raises:
+        InputError, WeldcalError: as ``calibrate_recorded`` for each, and ``solve_together``.
+    """
+    if len({file.resolve() for file in files}) < len(files):
+        raise InputError("A file is given twice: give the file of each sensor once.")
+    names = sensor_names(files)
+    each = []
+    for file, name in zip(files, names, strict=True):
+        try:
+            each.append(calibrate_recorded(file, asked, say))
+        except WeldcalError as problem:
+            text = f"{name}: {problem}"
+            raise InputError(f"{text} Each of several files holds the pairs of one sensor.") from problem
+    mountings = sorted({found.mounting.name for found in each})
+    if len(mountings) > 1:
+        raise InputError(f"The files are of the mountings {' and '.join(mountings)}: solve each by itself.")
+    if open_ := [name for name, found in zip(names, each, strict=True) if found.result.unobservable]:
+        raise InputError(f"The poses of '{open_[0]}' leave a direction open: add poses, or omit this file.")
+    plain = asked.corners is False
+    sensors = [
+        SensorPairs(name=name, pairs=replace(found.pairs, img=None) if plain else found.pairs, result=found.result)
+        for name, found in zip(names, each, strict=True)
+        if found.pairs is not None
+    ]
+    together = solve_together(sensors, HandEyeConfig(seed=asked.seed))
+    n = 6 * len(each)
+    joined = []
+    for k, found in enumerate(each):
+        rows = np.r_[6 * k : 6 * k + 6, n : n + 6]
+        S = together.covariance[np.ix_(rows, rows)]
+        others = ", ".join(name for name in names if name != names[k])
+        result = replace(
+            found.result,
+            poses={"X": as_transform(together.X[k]), "Y": as_transform(together.Y)},
+            covariance={"X": S[:6, :6], "Y": S[6:, 6:]},
+            joint_covariance=S,
+            method=f"together with {others}",
+        )
+        joined.append(replace(found, result=result, comparison=()))
+    return RecordedTogether(each=tuple(joined), together=together)
+
+
+def sensor_names(files: Sequence[Path]) -> list[str]:
+    """A name for each file: the last part of its path that differs from the others'; with a number where none does."""
+    paths = [file.resolve().with_suffix("") if file.is_file() else file.resolve() for file in files]
+    for part in range(1, 3):
+        names = [path.parts[-part] for path in paths if len(path.parts) > part]
+        if len(set(names)) == len(paths):
+            return names
+    return [f"{path.name}_{k}" for k, path in enumerate(paths, 1)]
 
 
 def _read(

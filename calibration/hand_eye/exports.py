@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import yaml
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, export_urdf, matrix4, software_version
+from weldcal.calibration.geometry.se3 import as_transform
 from weldcal.calibration.hand_eye.mountings import Mounting, Unknown
+from weldcal.calibration.hand_eye.several import SensorsTogether
 from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.files import write_atomic
 
@@ -105,6 +108,29 @@ def export_hand_eye(
     for name, text in files.items():
         write_atomic(folder / name, text)
     return tuple(folder / name for name in files)
+
+
+def export_together(found: SensorsTogether, folder: Path) -> None:
+    """Write together.yaml: the pose of every sensor in every earlier one, and their ROS 2 commands."""
+    rows = []
+    for i, j in combinations(range(len(found.names)), 2):
+        a, b, (X, S) = found.names[i], found.names[j], found.between(i, j)
+        rows.append({"parent": a, "child": b, "matrix": X.tolist(), "covariance": S.tolist()})
+        write_atomic(folder / f"{a}_to_{b}.static_transform.sh", export_ros2(as_transform(X), a, b))
+    whole = {
+        "schema": 1,
+        "software": software_version(),
+        "sensors": list(found.names),
+        "poses_measured": found.poses.tolist(),
+        "poses_shared": found.shared,
+        "between": rows,
+        "covariance_order": "rotation (rad) then translation (m), on the parent's side about the child's origin",
+        "robot_noise": {"deg": float(np.degrees(found.common[0])), "mm": 1e3 * found.common[1]},
+        "sensor_noise": [{"deg": float(np.degrees(w)), "mm": float(1e3 * d)} for w, d in found.noise],
+        "principal_point_shift_px": [None if np.isnan(s).any() else s.tolist() for s in found.shift_px],
+        "left_out_mm": {"apart": _number(1e3 * found.apart_m), "together": _number(1e3 * found.together_m)},
+    }
+    write_atomic(folder / "together.yaml", _yaml(whole))
 
 
 def _yaml(whole: dict[str, object]) -> str:

@@ -56,7 +56,7 @@ def one_per_pose(problem: Problem, known: State = (IDENTITY, IDENTITY, IDENTITY)
     alone = Repeats(problem, np.arange(n), np.ones(n, dtype=bool))
     if not join or problem.tied or n < 2 or not problem.all_full:
         return alone
-    place = _places(problem)
+    place = distinct_poses(problem)
     if int(place.max()) == n - 1:
         return alone
     noise = _noise(problem.pick(np.unique(place, return_index=True)[1]), known)
@@ -73,7 +73,7 @@ def _noise(problem: Problem, known: State) -> _Noise:
     return _Noise(found.noise.rotation + own[:3].max(), found.noise.translation + own[3:].max(), found.centre)
 
 
-def _places(problem: Problem) -> NDArray[np.int64]:
+def distinct_poses(problem: Problem) -> NDArray[np.int64]:
     """Number (n,) of the distinct robot pose of each sample, in the order of first appearance."""
     stated = (problem.F, problem.H) if float(np.abs(problem.H - problem.H[0]).max()) > 0.0 else (problem.F,)
     # the chordal distance of two rotation matrices is sqrt(2) times the angle

@@ -108,7 +108,8 @@ class HandEyeResult:
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
     ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target
     where it holds. ``observation`` (n,): the observation that each sample belongs to; repeats of a pose are one.
-    ``scale``: of the camera's distances where it is wrong. Lengths are in the unit of the data.
+    ``discord_rad``: angle, an axis, by which rotations and displacements disagree. ``scale``: of the camera's distances
+    where it is wrong. Lengths are in the unit of the data.
     """
 
     equation: str
@@ -133,6 +134,7 @@ class HandEyeResult:
     observation: NDArray[np.int64]
     labels: dict[str, str] = field(default_factory=dict)
     scale: CameraScale | None = None
+    discord_rad: float = 0.0
 
     @property
     def X(self) -> RigidTransform:
@@ -305,6 +307,7 @@ def solve_problem(
         extent=length,
         observation=observation,
         labels=labels,
+        discord_rad=s.discord,
     )
 
 

@@ -52,10 +52,11 @@ def matrices(poses: list[RigidTransform]) -> list[np.ndarray]:
     return [X.GetAsMatrix4() for X in poses]
 
 
-def _hand_eye(path: Path, mounting: str) -> None:
-    """Pairs of a UR10e, with its joint angles (rad), and 0.1 mm of noise."""
+def _hand_eye(path: Path, mounting: str, beside_m: float = 0.0) -> None:
+    """Pairs of a UR10e, with its joint angles (rad), and 0.1 mm of noise; of a camera that stands so far beside."""
     rng, arm = np.random.default_rng(3), load_arm("ur10e")
     X, Y = random_poses(2, rng)
+    X = X @ RigidTransform([beside_m, 0.0, 0.0])
     q = np.deg2rad([0.0, -80.0, 110.0, -120.0, -90.0, 0.0]) + rng.uniform(-0.6, 0.6, (24, 6))
     robot = [forward_kinematics(arm, joints) for joints in q]
     in_hand = mounting == "eye_in_hand"
@@ -220,6 +221,8 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_camera/camera.yaml": _camera,
     "samples.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
+    "camera1.npz": lambda path: _hand_eye(path, "eye_on_base"),
+    "camera2.npz": lambda path: _hand_eye(path, "eye_on_base", 0.5),
     "two_robots.npz": _two_robots,
     "bracket.step": _bracket,
     "beam.step": _beam,

@@ -25,6 +25,7 @@ COMMANDS = {
     "compare": ("`compare RESULT RESULT`", "compare my-calibration my-calibration"),
     "import": ("`import`", "import samples.npz"),
     "hand-eye": ("`hand-eye`", "hand-eye ax-yb samples.npz"),
+    "two cameras": ("`hand-eye ax-yb` with several files", "hand-eye ax-yb camera1.npz camera2.npz"),
     "two robots": ("`hand-eye`", "hand-eye axb-ycz two_robots.npz"),
 }
 OTHERS = {

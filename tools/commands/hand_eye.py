@@ -7,20 +7,41 @@ from typing import Annotated
 
 import typer
 
-from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye
+from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye, export_together
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures.boards import FORMS
-from weldcal.calibration.recorded_hand_eye import HandEyeOptions, Say, calibrate_recorded, stated_forms
+from weldcal.calibration.recorded_hand_eye import (
+    HandEyeOptions,
+    Say,
+    calibrate_recorded,
+    calibrate_several,
+    stated_forms,
+)
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.hand_eye import HandEyeReport, hand_eye_report
+from weldcal.tools.report.hand_eye import (
+    HandEyeReport,
+    hand_eye_report,
+    together_page,
+    together_screen,
+    together_summary,
+)
 from weldcal.tools.report.render import write_atomic
 
 FileArgument = Annotated[
     Path,
     typer.Argument(
         help="A file or folder with the robot's and the camera's poses (docs/datasets.md), or two pose streams.",
+        show_default=False,
+    ),
+]
+FilesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILE...",
+        help="A file or folder with the robot's and the camera's poses (docs/datasets.md), or two pose streams; one for"
+        " each of several sensors.",
         show_default=False,
     ),
 ]
@@ -99,7 +120,7 @@ def ax_xb(
 )
 def ax_yb(
     call: Call,
-    file: FileArgument,
+    files: FilesArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
     corners: Annotated[
@@ -125,11 +146,14 @@ def ax_yb(
     board: BoardOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
+    """Solve AX = YB for the poses of camera and target, and propose the next pose to add. Several files are of several
+    sensors that measured one target on one robot: they are solved together, with the poses between them."""
     stated = stated_lists(call, robot_poses, camera_poses)
     known = HandEyeOptions(mounting=mounting, unit=unit, robot=robot, stated=stated, board=board)
     asked = replace(known, camera=camera, corners=corners, refine=refine, kinematics=kinematics)
-    return _solve(call, file, asked, limit_mm)
+    if len(files) > 1:
+        return _solve_several(call, files, asked, limit_mm)
+    return _solve(call, files[0], asked, limit_mm)
 
 
 @command("hand-eye axb-ycz", short_help="Solve AXB = YCZ for two robots.")
@@ -145,6 +169,24 @@ def axb_ycz(
     """Solve AXB = YCZ for camera, second base and target: one robot carries the camera, another the target."""
     asked = HandEyeOptions(equation="axb-ycz", mounting=mounting, unit=unit, robot=robot, camera=camera)
     return _solve(call, file, asked, limit_mm)
+
+
+def _solve_several(call: Call, files: list[Path], asked: HandEyeOptions, limit_mm: float | None) -> Outcome:
+    """Solve several sensors together; each has a folder with its own result."""
+    said: list[str] = []
+    check_limit(limit_mm)
+    asked = replace(asked, seed=call.seed, **{k: call.reading[k] for k in ("intrinsics",) if k in call.reading})
+    folder = call.folder("hand-eye", "together")
+    found = calibrate_several(files, asked, said.append)
+    for file, name, one in zip(files, found.together.names, found.each, strict=True):
+        provenance = Provenance(file.name, digest(file))
+        wrote = export_hand_eye(one.result, one.mounting, folder / name, provenance)
+        report = HandEyeReport(**vars(one), files=wrote, seconds=0.0, limit_mm=limit_mm, folder=folder / name)
+        write_atomic(folder / name / "report.html", hand_eye_report(report, file.name, provenance.sha256))
+    export_together(found.together, folder)
+    first = together_screen(found, limit_mm)
+    write_atomic(folder / "report.html", together_page(found, first))
+    return Outcome({"state": "done", **together_summary(found)}, text="\n".join(said), first=first)
 
 
 def _solve(call: Call, file: Path, asked: HandEyeOptions, limit_mm: float | None) -> Outcome:

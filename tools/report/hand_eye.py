@@ -2,19 +2,31 @@
 
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.geometry.robust import radius_95
+from weldcal.calibration.geometry.se3 import angle_of, as_transform
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.pairs.importing import BY_MOTION
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import CameraScale, HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.recorded_hand_eye import RecordedHandEye
+from weldcal.calibration.recorded_hand_eye import RecordedHandEye, RecordedTogether
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, limit_tolerance
+from weldcal.tools.report.first_screen import (
+    ENOUGH_UNSEEN,
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    limit_tolerance,
+)
+from weldcal.tools.report.page import Section, TableRows, page_html
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 
@@ -249,6 +261,96 @@ def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
 def _sigma_words(r: HandEyeResult, k: str) -> str:
     sigma = np.sqrt(np.diag(r.covariance[k]))
     return f"{_sigmas(1e3 * sigma[3:], 1e3 * r.extent)} mm; {_sigmas(np.degrees(sigma[:3]), 57.3)} deg"
+
+
+def together_rows(found: RecordedTogether) -> list[tuple[str, str]]:
+    """For each two sensors their names, and distance and angle with the 95 % radius and sigma."""
+    rows, joint = [], found.together
+    for i, j in combinations(range(len(joint.names)), 2):
+        X, S = joint.between(i, j)
+        turn = np.degrees(np.sqrt(np.trace(S[:3, :3])))
+        rows.append(
+            (
+                f"{joint.names[j]} in {joint.names[i]}",
+                f"{1e3 * np.linalg.norm(X[:3, 3]):.3f} mm away, within {1e3 * radius_95(S[3:, 3:]):.3f} mm (95 %);"
+                f" turned by {np.degrees(angle_of(X[:3, :3])):.4f} deg, one sigma {turn:.4f} deg",
+            )
+        )
+    return rows
+
+
+def together_screen(found: RecordedTogether, limit_mm: float | None) -> FirstScreen:
+    """Return the first screen of several sensors: its verdict rests on the sensor with the largest held-out error."""
+    joint, parts = found.together, list(zip(found.together.names, found.each, strict=True))
+    expected, p95, n, name = max(((*held_out_error(one.result), name) for name, one in parts), key=lambda row: row[1])
+    tolerance = limit_tolerance(expected.what, p95, limit_mm)
+    concerns = [f"{name}: {text}" for name, one in parts for text in one.result.warnings]
+    if joint.shared < ENOUGH_UNSEEN:
+        concerns.insert(
+            0,
+            f"Only {joint.shared} robot poses are of more than one sensor, so that the poses between sensors rest on"
+            " the robot: measure with all sensors at each pose.",
+        )
+    notes = [f"{name}: {text}" for name, one in parts for text in one.read_notes]
+    if np.isfinite(joint.together_m):
+        notes.insert(
+            0,
+            f"At left-out poses two sensors find the target {1e3 * joint.together_m:.3f} mm apart (rms);"
+            f" {1e3 * joint.apart_m:.3f} mm where each is solved by its poses alone.",
+        )
+    shown = [
+        replace(pose, symbol=f"{pose.symbol} of {name}", aside=True)
+        for name, one in parts
+        for pose in shown_poses(one.result, one.mounting)
+    ]
+    return FirstScreen(
+        Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes),
+        replace(expected, backing=f"{name}, the largest of {len(parts)} sensors: {expected.backing}"),
+        Next("Record pairs that are not in the files, and verify each result folder with them.", uses=True),
+        tuple(shown),
+        dict(together_rows(found)),
+    )
+
+
+def together_summary(found: RecordedTogether) -> dict[str, object]:
+    """Return the JSON object of several sensors."""
+    joint = found.together
+    between = [(i, j, *joint.between(i, j)) for i, j in combinations(range(len(joint.names)), 2)]
+    return {
+        "configuration": found.each[0].mounting.name,
+        "sensors": [
+            {"name": name, "X": one.result.X, "covariance_X": one.result.covariance["X"], "poses": int(count)}
+            for name, one, count in zip(joint.names, found.each, joint.poses, strict=True)
+        ],
+        "between": [
+            {"parent": joint.names[i], "child": joint.names[j], "X": as_transform(X), "covariance_X": S}
+            for i, j, X, S in between
+        ],
+        "shared_poses": joint.shared,
+        "left_out_apart_mm": 1e3 * joint.apart_m,
+        "left_out_together_mm": 1e3 * joint.together_m,
+    }
+
+
+def together_page(found: RecordedTogether, first: FirstScreen) -> str:
+    """Return the report of several sensors as one self-contained HTML text."""
+    joint = found.together
+    sigmas = [
+        (name, str(n), f"{np.degrees(w):.4f}", f"{1e3 * d:.3f}")
+        for name, n, (w, d) in zip(
+            ("the robot, for all sensors", *joint.names),
+            (f"{joint.shared} shared", *joint.poses),
+            (joint.common, *joint.noise),
+            strict=True,
+        )
+    ]
+    sections: list[Section] = [
+        ("Between the sensors", [TableRows(together_rows(found), text=(0, 1))]),
+        ("Errors as found", [TableRows(sigmas, ("of", "poses", "deg, per axis", "mm, per axis"))]),
+    ]
+    return page_html(
+        "Sensors together", f"{found.each[0].mounting.name}, {len(joint.names)} sensors", sections, first=first
+    )
 
 
 def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
