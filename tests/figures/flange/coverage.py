@@ -220,6 +220,9 @@ def stated(run: Run) -> None:
             way = "local" if local else "plain"
             rows.append((str(poses), way, fixed(1e3 * warp_m, 1), fixed(1e3 * true_m), fixed(ratio, 2)))
     rows.append(("all", "", "", "", fixed(float(np.mean(ratios)), 2)))
+    for poses in (10, 14, 20):
+        true_m, ratio = study_stated(poses, 0.0, 3e-4 / np.sqrt(3.0), runs, local=False)
+        rows.append((str(poses), "plain, arm of 0.3 mm", "0.0", fixed(1e3 * true_m), fixed(ratio, 2)))
     run.table("", ("scans", "way", "scanner off, mm", "true mean error, mm", "stated over true"), rows)
 
 

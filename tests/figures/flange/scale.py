@@ -5,15 +5,18 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from tests.calibration.eye_on_base.test_left_uncorrected import scaled
+from tests.calibration.planning.test_mounting_estimate import point_error
 from tests.figures.harness import Run, figure
+from tests.worlds.light_runs import mounted_world
 from weldcal.calibration.eye_on_base.estimate import point_error_covariance
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, left_uncorrected
 from weldcal.calibration.eye_on_base.solve import SolveConfig
+from weldcal.calibration.planning.mounting_estimate import solve_mounting
 
 
 @figure("scanner-scale", "stated regions with a scanner scale of -0.3 to 0.3 %, with and without a correction")
 def scanner_scale(run: Run) -> None:
-    """Count regions that hold the truth, where a correction is chosen, where none is, and where no hole is seen."""
+    """Count regions that hold the truth: a correction chosen, not chosen, no hole in view, and a carried scanner."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for holes in (True, False):
         for seed in run.seeds(10, 250):
@@ -34,6 +37,15 @@ def scanner_scale(run: Run) -> None:
             of_X = float(d @ np.linalg.solve(e.covariance, d) < chi2.ppf(0.95, 6))
             kind = "no hole circle" if not holes else "correction chosen" if applied else "not chosen"
             rows.setdefault(kind, []).append((of_X, float(np.mean(inside))))
+    for name in ("eye_in_hand", "eye_on_arm"):
+        for seed in run.seeds(3, 60):
+            for scans in (8, 14, 20):
+                world = mounted_world(name, 2000 + seed, scans=scans)
+                found = solve_mounting(world.scene, world.seen)
+                off, C = point_error(world, found)
+                of_X = float(found.normalised_error("X", world.true.X_LC) < chi2.ppf(0.95, 6))
+                of_point = float(off @ np.linalg.solve(C, off) < chi2.ppf(0.95, 3))
+                rows.setdefault(f"carried, {name}, -0.2 %", []).append((of_X, of_point))
     heads = ("", "sets", "X_BC inside", "points inside")
     table = [(k, str(len(v)), *(f"{100 * x:.1f} %" for x in np.mean(v, axis=0))) for k, v in rows.items()]
     run.table("", heads, table)
