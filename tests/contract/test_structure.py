@@ -17,7 +17,7 @@ BOUNDS = {
     "code lines of calibration": 32_459,
     "code lines of models": 6_475,
     "code lines of systems": 19_389,
-    "code lines of tools": 23_693,
+    "code lines of tools": 23_696,
     "code lines of welding": 9_603,
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

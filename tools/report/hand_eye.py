@@ -271,7 +271,7 @@ def together_rows(found: RecordedTogether) -> list[tuple[str, str]]:
         turn = np.degrees(np.sqrt(np.trace(S[:3, :3])))
         rows.append(
             (
-                f"{joint.names[j]} in {joint.names[i]}",
+                f"from {joint.names[i]} to {joint.names[j]}",
                 f"{1e3 * np.linalg.norm(X[:3, 3]):.3f} mm away, within {1e3 * radius_95(S[3:, 3:]):.3f} mm (95 %);"
                 f" turned by {np.degrees(angle_of(X[:3, :3])):.4f} deg, one sigma {turn:.4f} deg",
             )
@@ -282,7 +282,9 @@ def together_rows(found: RecordedTogether) -> list[tuple[str, str]]:
 def together_screen(found: RecordedTogether, limit_mm: float | None) -> FirstScreen:
     """Return the first screen of several sensors: its verdict rests on the sensor with the largest held-out error."""
     joint, parts = found.together, list(zip(found.together.names, found.each, strict=True))
-    expected, p95, n, name = max(((*held_out_error(one.result), name) for name, one in parts), key=lambda row: row[1])
+    expected, p95, n, name = max(
+        ((*held_out_error(one.result), name) for name, one in parts), key=lambda row: np.nan_to_num(row[1], nan=np.inf)
+    )
     tolerance = limit_tolerance(expected.what, p95, limit_mm)
     concerns = [f"{name}: {text}" for name, one in parts for text in one.result.warnings]
     if joint.shared < ENOUGH_UNSEEN:
@@ -301,13 +303,14 @@ def together_screen(found: RecordedTogether, limit_mm: float | None) -> FirstScr
     shown = [
         replace(pose, symbol=f"{pose.symbol} of {name}", aside=True)
         for name, one in parts
-        for pose in shown_poses(one.result, one.mounting)
+        for pose in shown_poses(one.result, one.mounting)[:1]
     ]
+    target = shown_poses(parts[0][1].result, parts[0][1].mounting)[1]
     return FirstScreen(
         Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes),
         replace(expected, backing=f"{name}, the largest of {len(parts)} sensors: {expected.backing}"),
         Next("Record pairs that are not in the files, and verify each result folder with them.", uses=True),
-        tuple(shown),
+        (*shown, replace(target, aside=True)),
         dict(together_rows(found)),
     )
 

@@ -128,7 +128,7 @@ def test_the_command_writes_a_result_for_each_sensor_and_the_poses_between(tmp_p
     own = yaml.safe_load((tmp_path / "out" / "camera2" / "hand_eye.yaml").read_text())
     np.testing.assert_allclose(own["poses"]["X_BC"]["matrix"], summary["sensors"][1]["X"], atol=1e-9)
     assert own["method"] == "together with camera1"
-    assert "camera2 in camera1" in (tmp_path / "out" / "report.html").read_text()
+    assert "From camera1 to camera2" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
