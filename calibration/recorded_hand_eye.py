@@ -213,7 +213,13 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
         raise InputError(f"The poses of '{open_[0]}' leave a direction open: add poses, or omit this file.")
     plain = asked.corners is False
     sensors = [
-        SensorPairs(name=name, pairs=replace(found.pairs, img=None) if plain else found.pairs, result=found.result)
+        SensorPairs(
+            name=name,
+            pairs=replace(found.pairs, img=None) if plain else found.pairs,
+            result=found.result,
+            bundle=None if found.pictures is None else found.pictures.bundle,
+            free=None if found.pictures is None else found.pictures.free,
+        )
         for name, found in zip(names, each, strict=True)
         if found.pairs is not None
     ]

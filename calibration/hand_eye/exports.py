@@ -127,7 +127,6 @@ def export_together(found: SensorsTogether, folder: Path) -> None:
         "covariance_order": "rotation (rad) then translation (m), on the parent's side about the child's origin",
         "robot_noise": {"deg": float(np.degrees(found.common[0])), "mm": 1e3 * found.common[1]},
         "sensor_noise": [{"deg": float(np.degrees(w)), "mm": float(1e3 * d)} for w, d in found.noise],
-        "principal_point_shift_px": [None if np.isnan(s).any() else s.tolist() for s in found.shift_px],
         "left_out_mm": {"apart": _number(1e3 * found.apart_m), "together": _number(1e3 * found.together_m)},
     }
     write_atomic(folder / "together.yaml", _yaml(whole))

@@ -15,6 +15,7 @@ from weldcal.calibration.geometry.se3 import IDENTITY, inverse, mean_pose, moved
 from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD
 from weldcal.calibration.hand_eye.corners import poses_from_corners
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
+from weldcal.calibration.hand_eye.pictures.bundle import Bundle, board_terms
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
 from weldcal.calibration.hand_eye.repeats import distinct_poses
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, fold_labels, solve_problem
@@ -22,11 +23,12 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
 _ROUNDS, _SETTLED = 10, 1e-3  # linearisations at most; steps in sigmas that change no answer
-_LEAST, _MOST, _MOST_PX = 1e-6, 0.4, 20.0  # of a standard deviation, rad, m and px: beyond those of any calibration
+# Bounds of a standard deviation, rad or m, and px: beyond those of any calibration, near enough for double precision.
+_LEAST, _MOST, _LEAST_PX, _MOST_PX = 1e-6, 0.1, 1e-3, 20.0
 _LOOSE = 1e-3  # information of the logarithm of a standard deviation about its start: only bounds what is open
 _DIFFERENT = 4.0  # a choice: so many times its own noise a sensor leaves beside the others where the targets differ
 _START_PX = 0.2  # of a corner, where the search for its size begins
-_STEP_PX = 0.5  # of the difference that shows what the principal point moves
+_STEP = 0.1  # sigma, of the differences that show what an error of a camera changes
 
 SharedError = tuple[float, float]
 """Standard deviations per axis, rad and m."""
@@ -34,11 +36,17 @@ SharedError = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SensorPairs:
-    """One sensor: its pairs, and its own solution of them with X and Y free."""
+    """One sensor: its pairs, and its own solution of them with X and Y free.
+
+    ``bundle``, ``free``: of pictures, the adjustment that ``pairs`` have their camera and board from, and the numbers of
+    the camera that it estimated.
+    """
 
     name: str
     pairs: PosePairs
     result: HandEyeResult
+    bundle: Bundle | None = None
+    free: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,7 +62,7 @@ class SensorsTogether:
         common: rad and m, per axis, of the errors at a robot pose that all sensors share: the robot's.
         sizes: (N + 1, 2) the standard deviations of the model: the robot's rad and m, then each sensor's rad and m; of
             cameras with corners px and m.
-        shift_px: (N, 2) shift of the principal point of cameras with corners; NaN without.
+        cameras: errors of the cameras, in standard deviations, as the solution has them.
         poses: distinct robot poses (N,) of each sensor.
         shared: distinct robot poses that more than one sensor measured.
         apart_m, together_m: rms distance between where two sensors find the target at a robot pose that neither
@@ -68,7 +76,7 @@ class SensorsTogether:
     noise: Array
     common: SharedError
     sizes: Array
-    shift_px: Array
+    cameras: Array
     poses: NDArray[np.int64]
     shared: int
     apart_m: float = float("nan")
@@ -120,8 +128,8 @@ def solve_together(sensors: Sequence[SensorPairs], config: HandEyeConfig | None 
     for rotations and one for displacements of the target's middle. Where a camera's corners are given, an error of each
     corner takes the place of the rotations. The standard deviations follow from the restricted
     likelihood. Camera to camera is thus as good as the sensors are, however bad the robot. Cameras with corners have an
-    unknown shift of the principal point, with the standard deviation USUAL_DISCORD_RAD; the covariance of others holds
-    the discord of their own solution. Observations that a sensor's own solution excluded are not used.
+    unknown shift of the principal point, with the standard deviation USUAL_DISCORD_RAD. The covariance contains the
+    discord of the own solution of sensors without, and the errors of camera and board of pictures. Observations that a sensor's own solution excluded are not used.
 
     Raises:
         InconsistentPoses: one of the sensors saw another target.
@@ -180,18 +188,19 @@ def _picked(p: PosePairs, rows: NDArray[np.bool_] | NDArray[np.int64]) -> PosePa
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """State of the solution: poses, shifts (N, 2) px, and logarithms of the standard deviations (2 N + 2,)."""
+    """State of the solution: poses, errors of the cameras in sigmas, and logarithms of the standard deviations."""
 
     X: Array
     Y: Array
-    shift: Array
+    cameras: Array
     logs: Array
 
 
 class _Joint:
     """The linear problem of all sensors at a state.
 
-    Unknowns: X of each sensor and Y, 6 each; then 2 of each camera with corners: the shift of its principal point.
+    Unknowns: X of each sensor and Y, 6 each; then errors of each camera with corners, in standard deviations: the shift
+    of its principal point, or of pictures what their adjustment left of camera and board.
     """
 
     def __init__(self, sensors: Sequence[SensorPairs], pairs: Sequence[PosePairs]) -> None:
@@ -199,13 +208,14 @@ class _Joint:
         self.problems = [full_problem(p.F, p.G, p.H) for p in pairs]
         n = len(sensors)
         self.corners = np.array([_has_corners(p) for p in pairs])
+        self.errors = [_errors(s) if corners else _NO_ERRORS for s, corners in zip(sensors, self.corners, strict=True)]
         self.core = 6 * n + 6
-        self.at_shift = self.core + 2 * (np.cumsum(self.corners) - 1)
-        self.size = self.core + 2 * int(self.corners.sum())
+        last = self.core + np.cumsum([one.size for one in self.errors])
+        self.columns = [slice(int(end) - one.size, int(end)) for end, one in zip(last, self.errors, strict=True)]
+        self.size = int(last[-1])
         self.centre = np.asarray(np.mean([s.result.noise_centre for s in sensors], axis=0))
-        self.most = np.full((n + 1, 2), _MOST)
-        self.most[1:, 0] = np.where(self.corners, _MOST_PX, _MOST)
-        self.sigma_px = [USUAL_DISCORD_RAD * (1.0 if p.K is None else float(p.K[0, 0])) for p in pairs]
+        self.bounds = np.tile([_LEAST, _MOST], (n + 1, 2, 1))
+        self.bounds[1:, 0][self.corners] = _LEAST_PX, _MOST_PX
 
     def start(self, k: int) -> _At:
         """The sensors' own solutions, with the target of sensor ``k``."""
@@ -214,7 +224,7 @@ class _Joint:
         own = np.array([[r.sigma_rotation_rad, r.sigma_translation] for r in results])
         logs = np.log(np.maximum(np.vstack([0.5 * own.min(axis=0), own]), 2.0 * _LEAST))
         logs[1:, 0] = np.where(self.corners, np.log(_START_PX), logs[1:, 0])
-        return _At(X, np.asarray(results[k].Y.GetAsMatrix4()), np.zeros((len(X), 2)), logs.ravel())
+        return _At(X, np.asarray(results[k].Y.GetAsMatrix4()), np.zeros(self.size - self.core), logs.ravel())
 
     def shape(self, k: int) -> Array:
         """Covariances (n, 2, 6, 6) of the errors of sensor ``k``, in units of its two variances.
@@ -239,67 +249,68 @@ class _Joint:
                 out[i, 0] = np.linalg.inv(J.T @ J)
         return out
 
-    def measured(self, k: int, shift: Array) -> Problem:
-        """The equation of sensor ``k`` with its principal point shifted."""
-        if not self.corners[k]:
+    def measured(self, k: int, at: _At, more: Array | float = 0.0) -> Problem:
+        """The equation of sensor ``k`` with the errors of its camera, and ``more``, taken off."""
+        p, one, columns = self.pairs[k], self.errors[k], self.columns[k]
+        if not one.size:
             return self.problems[k]
-        return replace(self.problems[k], G=poses_from_corners(self.pairs[k], shift))
+        assert p.K is not None
+        assert p.obj is not None
+        x = at.cameras[columns.start - self.core : columns.stop - self.core] + more
+        f = len(one.free)
+        c = np.r_[p.K[0, 0], p.K[1, 1], p.K[:2, 2], np.zeros(5) if p.dist is None else p.dist]
+        c[one.free] += one.root @ x[:f]
+        K = np.array([[c[0], 0.0, c[2]], [0.0, c[1], c[3]], [0.0, 0.0, 1.0]])
+        obj = p.obj + board_terms(p.obj)[0] @ (one.board * x[f:]) if one.size > f else p.obj
+        return replace(self.problems[k], G=poses_from_corners(replace(p, K=K, dist=c[4:], obj=obj), np.zeros(2)))
 
-    def lines(self, rows: _Rows, at: _At) -> tuple[Array, Array, Array]:
-        """Residuals (n, 6), derivatives (n, 6, m), and those (n, 6, 3) by a turn of the displacements alone."""
+    def lines(self, rows: _Rows, at: _At) -> tuple[Array, Array]:
+        """Residuals (n, 6) and derivatives (n, 6, m)."""
         n = len(self.sensors)
         e, J = np.zeros((len(rows.sample), 6)), np.zeros((len(rows.sample), 6, self.size))
-        turned = np.zeros((len(rows.sample), 6, 3))
         for k in range(n):
             mine = rows.sensor == k
             sample = rows.sample[mine]
             state = (at.X[k], at.Y, IDENTITY)
-            lin = linearise(self.measured(k, at.shift[k]).pick(sample), state, self.centre)
+            lin = linearise(self.measured(k, at).pick(sample), state, self.centre)
             e[mine] = np.concatenate([lin.w, lin.d], axis=1)
             by = np.concatenate([lin.Jw, lin.Jd], axis=1)
             J[mine, :, 6 * k : 6 * k + 6], J[mine, :, 6 * n : 6 * n + 6] = by[:, :, :6], by[:, :, 6:12]
-            turned[mine, 3:] = lin.Jd[:, :, :3]
-            for axis in range(2) if self.corners[k] else ():
-                step = _STEP_PX * np.eye(2)[axis]
+            for column, step in enumerate(_STEP * np.eye(self.errors[k].size), self.columns[k].start):
                 up, down = (
-                    np.concatenate(
-                        residuals(self.measured(k, at.shift[k] + s).pick(sample), state, self.centre), axis=1
-                    )
+                    np.concatenate(residuals(self.measured(k, at, s).pick(sample), state, self.centre), axis=1)
                     for s in (step, -step)
                 )
-                J[mine, :, self.at_shift[k] + axis] = (up - down) / (2.0 * _STEP_PX)
-        return e, J, turned
+                J[mine, :, column] = (up - down) / (2.0 * _STEP)
+        return e, J
 
-    def prior(self, at: _At) -> tuple[Array, Array]:
-        """Information (m,) of the unknowns before the data, and their distances (m,) from its mean."""
-        information, off = np.zeros(self.size), np.zeros(self.size)
-        for k in np.flatnonzero(self.corners):
-            columns = slice(self.at_shift[k], self.at_shift[k] + 2)
-            information[columns], off[columns] = self.sigma_px[k] ** -2.0, at.shift[k]
-        return information, off
+    def turned(self, k: int, rows: _Rows, at: _At) -> Array:
+        """Derivatives (n, 6, 3) by a turn of the displacements of sensor ``k`` alone."""
+        mine = rows.sensor == k
+        out = np.zeros((len(rows.sample), 6, 3))
+        problem = self.problems[k].pick(rows.sample[mine])
+        out[mine, 3:] = linearise(problem, (at.X[k], at.Y, IDENTITY), self.centre).Jd[:, :, :3]
+        return out
 
     def solved(self, rows: _Rows, at: _At) -> SensorsTogether:
         """Alternate between the restricted likelihood of the standard deviations and a step of the unknowns."""
         n, groups, shared, begin = len(self.sensors), rows.groups, rows.shared, at.logs
         for _ in range(_ROUNDS):
-            e, J, turned = self.lines(rows, at)
-            information, off = self.prior(at)
+            e, J = self.lines(rows, at)
+            information, off = np.zeros(self.size), np.zeros(self.size)
+            information[self.core :], off[self.core :] = 1.0, at.cameras
             total = partial(_summed, rows, groups, e, J, information, off)
-            logs = _likeliest(total, at.logs, begin, self.most.ravel(), common=shared > 1)
+            logs = _likeliest(total, at.logs, begin, self.bounds.reshape(-1, 2), common=shared > 1)
             N, b, *_ = total(np.exp(logs))
             S = np.asarray(np.linalg.inv(N), dtype=float)
             step = -S @ b
             X = np.array([moved(X, step[6 * k : 6 * k + 6]) for k, X in enumerate(at.X)])
-            shift = at.shift.copy()
-            for k in np.flatnonzero(self.corners):
-                shift[k] += step[self.at_shift[k] : self.at_shift[k] + 2]
-            at = _At(X, moved(at.Y, step[6 * n : 6 * n + 6]), shift, logs)
+            at = _At(X, moved(at.Y, step[6 * n : self.core]), at.cameras + step[self.core :], logs)
             if float(step @ N @ step) < _SETTLED**2:
                 break
         for k in np.flatnonzero(~self.corners):
             # the displacements may be those of a camera that is turned: not solved for, and so still uncertain
-            by = np.where((rows.sensor == k)[:, None, None], turned, 0.0)
-            pulled = S @ _pulled(rows, groups, np.exp(logs), J, by)
+            pulled = S @ _pulled(rows, groups, np.exp(logs), J, self.turned(int(k), rows, at))
             S = S + self.sensors[int(k)].result.discord_rad ** 2 * pulled @ pulled.T
         sizes = np.exp(at.logs).reshape(-1, 2)
         mean = np.einsum("nv,nvii->ni", sizes[1 + rows.sensor] ** 2, rows.shape)
@@ -312,7 +323,7 @@ class _Joint:
             noise=np.sqrt(noise),
             sizes=sizes,
             common=(float(sizes[0, 0]), float(sizes[0, 1])) if shared > 1 else (0.0, 0.0),
-            shift_px=np.where(self.corners[:, None], at.shift, np.nan),
+            cameras=at.cameras,
             poses=np.bincount(rows.sensor, minlength=n),
             shared=shared,
         )
@@ -331,7 +342,12 @@ def _roots(rows: _Rows, group: NDArray[np.int64], sizes: Array) -> Array:
 
 
 def _likeliest(
-    total: Callable[[Array], tuple[Array, Array, float, float]], logs: Array, begin: Array, most: Array, *, common: bool
+    total: Callable[[Array], tuple[Array, Array, float, float]],
+    logs: Array,
+    begin: Array,
+    bounds: Array,
+    *,
+    common: bool,
 ) -> Array:
     """Logarithms of the standard deviations that maximise the restricted likelihood, the common ones where asked."""
     free = slice(0 if common else 2, None)
@@ -348,8 +364,8 @@ def _likeliest(
         log += 2.0 * float(np.log(np.diag(L) / unit).sum())
         return float(square - x @ x + log + _LOOSE * ((some - begin[free]) ** 2).sum())
 
-    bounds = [(np.log(_LEAST), np.log(most)) for most in most[free]]
-    whole[free] = minimize(deviance, logs[free], method="L-BFGS-B", bounds=bounds).x
+    limits = [(float(low), float(high)) for low, high in np.log(bounds[free])]
+    whole[free] = minimize(deviance, logs[free], method="L-BFGS-B", bounds=limits).x
     return whole
 
 
@@ -382,6 +398,34 @@ def _pulled(rows: _Rows, groups: Sequence[NDArray[np.int64]], sizes: Array, J: A
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class _CameraErrors:
+    """Numbers of the camera that may be off, a root (f, f) of their covariance, and sigmas (0 or 6,) of board terms."""
+
+    free: NDArray[np.int64]
+    root: Array
+    board: Array
+
+    @property
+    def size(self) -> int:
+        return len(self.free) + len(self.board)
+
+
+_NO_ERRORS = _CameraErrors(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros(0))
+
+
+def _errors(s: SensorPairs) -> _CameraErrors:
+    """What may be off in the camera of a sensor with corners."""
+    assert s.pairs.K is not None
+    shift = USUAL_DISCORD_RAD * float(s.pairs.K[0, 0]) * np.eye(2)
+    if s.bundle is None or s.free is None:
+        return _CameraErrors(np.array([2, 3]), shift, np.zeros(0))
+    if not len(s.free):
+        return _CameraErrors(np.array([2, 3]), shift, s.bundle.terms_sigma)
+    root = np.asarray(np.linalg.cholesky(s.bundle.camera_covariance), dtype=float)
+    return _CameraErrors(s.free, root, s.bundle.terms_sigma)
+
+
 def _has_corners(pairs: PosePairs) -> bool:
     """Whether the board's pose follows from the corners of every picture."""
     if not pairs.has_corners:
@@ -399,7 +443,7 @@ def _held_out(work: _Joint, rows: _Rows, config: HandEyeConfig, found: SensorsTo
     label = np.zeros(int(places.max()) + 1, dtype=np.int64)
     label[places] = fold_labels(len(places))
     squares: list[tuple[float, float]] = []
-    start = _At(found.X, found.Y, np.nan_to_num(found.shift_px), np.log(np.maximum(found.sizes, _LEAST).ravel()))
+    start = _At(found.X, found.Y, found.cameras, np.log(np.maximum(found.sizes, _LEAST).ravel()))
     for fold in range(5):
         out = label[rows.place] == fold
         test = rows.pick(out)
@@ -415,8 +459,8 @@ def _held_out(work: _Joint, rows: _Rows, config: HandEyeConfig, found: SensorsTo
             continue
         joint = work.solved(train, start)
         X = np.array([np.asarray(r.X.GetAsMatrix4()) for r in own])
-        apart = replace(start, X=X, shift=np.zeros_like(start.shift))
-        joined = replace(start, X=joint.X, shift=np.nan_to_num(joint.shift_px))
+        apart = replace(start, X=X, cameras=np.zeros_like(start.cameras))
+        joined = replace(start, X=joint.X, cameras=joint.cameras)
         rest = [work.lines(test, at)[0][:, 3:] for at in (apart, joined)]
         for group in test.groups:
             for i, j in combinations(range(group.shape[1]), 2):
