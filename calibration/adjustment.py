@@ -167,13 +167,11 @@ def adjust(
         for i, (kind, row) in enumerate(zip(kinds, seen, strict=True)):
             if count == 0:
                 sigmas.append(kind.sigma or max(by_median(Remainder(row.e)), kind.floor))
-            n, k, _ = row.J.shape
-            own = np.asarray(row.own) if np.ndim(row.own) else np.full(n, row.own)
-            if own.ndim == 1:
-                W = 1.0 / (own[:, None] + sigmas[i] ** 2)
+            if np.ndim(row.own) < 2:
+                W = 1.0 / (np.reshape(row.own, (-1, 1)) + sigmas[i] ** 2)
                 We, WJ = W * row.e, W[:, :, None] * row.J
             else:
-                W = np.asarray(np.linalg.inv(own + sigmas[i] ** 2 * np.eye(k)), dtype=float)
+                W = np.linalg.inv(row.own + sigmas[i] ** 2 * np.eye(row.J.shape[1]))
                 We, WJ = (W @ row.e[:, :, None])[:, :, 0], W @ row.J
             square = (row.e * We).sum(axis=1)
             w = kind.loss(square, kind.rank)
@@ -190,7 +188,7 @@ def adjust(
         step = -V @ g
         at = at.moved(step)
         spare = [
-            max(kind.rank * len(row.e) - float((V * part).sum()), 0.3)  # a part of one number: no division by zero
+            max(kind.rank * len(row.e) - float(np.vdot(V, part)), 0.3)  # a part of one number: no division by zero
             for kind, row, part in zip(kinds, seen, parts, strict=True)
         ]
         change = 0.0
