@@ -167,21 +167,23 @@ def adjust(
         for i, (kind, row) in enumerate(zip(kinds, seen, strict=True)):
             if count == 0:
                 sigmas.append(kind.sigma or max(by_median(Remainder(row.e)), kind.floor))
-            if np.ndim(row.own) < 2:
-                W = 1.0 / (np.reshape(row.own, (-1, 1)) + sigmas[i] ** 2)
-                We, WJ = W * row.e, W[:, :, None] * row.J
-            else:
+            whole = isinstance(row.own, np.ndarray) and row.own.ndim == 3
+            if whole:
                 W = np.linalg.inv(row.own + sigmas[i] ** 2 * np.eye(row.J.shape[1]))
-                We, WJ = (W @ row.e[:, :, None])[:, :, 0], W @ row.J
-            square = (row.e * We).sum(axis=1)
+                square = np.vecdot(row.e, (W @ row.e[:, :, None])[:, :, 0])
+            else:
+                W = 1.0 / (np.reshape(row.own, (-1, 1, 1)) + sigmas[i] ** 2)
+                square = np.vecdot(row.e, row.e) * W[:, 0, 0]
             w = kind.loss(square, kind.rank)
-            J = (w[:, None, None] * row.J).reshape(-1, m)
-            parts.append(J.T @ WJ.reshape(-1, m))
+            wW = w[:, None, None] * W
+            WJ = (wW @ row.J if whole else wW * row.J).reshape(-1, m).T
+            parts.append(WJ @ row.J.reshape(-1, m))
             N += parts[-1]
-            g += J.T @ We.ravel()
+            g += WJ @ row.e.ravel()
             squares.append(float(w @ square))
-        unit = np.sqrt(np.where(np.diag(N) > 0.0, np.diag(N), 1.0))
-        values, vectors = np.linalg.eigh(N / np.outer(unit, unit))
+        own = N.diagonal()
+        unit = np.sqrt(np.where(own > 0.0, own, 1.0))
+        values, vectors = np.linalg.eigh(N / unit / unit[:, None])
         clear = values > _SINGULAR * values[-1]
         U = vectors[:, clear] / unit[:, None]
         V = (U / values[clear]) @ U.T

@@ -420,12 +420,9 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
     for axes, (i, j), title in zip(all_axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         reach = 0.5 * extent * (1.0 + 2.0 * _MARGIN)
         u, v = (np.linspace(-reach, reach, _STEPS) + middle[k] for k in (i, j))
-        sigma = np.empty((_STEPS, _STEPS))
-        for row, b in enumerate(v):
-            for column, a in enumerate(u):
-                p = middle.copy()
-                p[i], p[j] = a, b
-                sigma[row, column] = 1e3 * sigma_at(estimate, p)
+        p = np.tile(middle, (_STEPS, _STEPS, 1))
+        p[..., i], p[..., j] = u, v[:, None]
+        sigma = 1e3 * np.sqrt(np.trace(point_error_covariance(estimate, p), axis1=-2, axis2=-1))
         drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
         for at, mark, size, colour, label in (
             (p_B, "o", 5, "white", "poses taken"),
