@@ -310,6 +310,6 @@ def _above_tip(capsule: Capsule, X_FT: RigidTransform) -> tuple[Array, Array, fl
 
 
 def _distances(points: NDArray[np.float64], a: Array, b: Array) -> Array:
-    d = b - a
-    share = np.clip((points - a) @ d / max(float(d @ d), 1e-12), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(points - a - share[:, None] * d, axis=1))
+    d, q = b - a, points - a
+    q -= np.clip(q @ d / max(float(d @ d), 1e-12), 0.0, 1.0)[:, None] * d
+    return np.asarray(np.sqrt(np.vecdot(q, q)))
