@@ -75,7 +75,7 @@ def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_
         a, b = ((low - reach_m - eye) / d).T, ((high + reach_m - eye) / d).T
     near = near[reduce(np.maximum, np.minimum(a, b)) <= reduce(np.minimum, np.maximum(a, b))]
     stride = max(1.0, len(near) / MOST_RAYS)
-    return near[(np.arange(int(len(near) / stride)) * stride).astype(int)]
+    return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
 
 
 def cast(rays: Ints, scan: PreparedScan, model: PartModel, X_BP: RigidTransform) -> tuple[Floats, ...]:

@@ -120,9 +120,7 @@ def contour(model: PartModel, eye: Floats) -> SharpEdges:
     far = np.linalg.norm(d, axis=1)
     hit, _ = model.ranges(eye, d / far[:, None])
     index = index[hit > far + 0.0025]
-    return SharpEdges(
-        e.point[index], e.tangent[index], e.normal[index], e.outward[index], e.other[index], e.chain[index]
-    )
+    return SharpEdges(*(getattr(e, f.name)[index] for f in fields(e)))
 
 
 _Rows = TypeVar("_Rows", SharpEdges, Equations)
