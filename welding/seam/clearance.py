@@ -147,9 +147,8 @@ def check_beside(
         for k, (a, b, radius) in enumerate(spans):
             met = np.flatnonzero(cells_met[k][cell])
             met = met[_distances((other[met] - tip.position) @ R - [0.0, 0.0, lift], a, b) < radius]
-            if k >= len(
-                above
-            ):  # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+            # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+            if k >= len(above):
                 met = met[~flat[met]]
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
             if len(met) and len(both) >= least and stops is not None:
