@@ -167,30 +167,30 @@ def adjust(
         for i, (kind, row) in enumerate(zip(kinds, seen, strict=True)):
             if count == 0:
                 sigmas.append(kind.sigma or max(by_median(Remainder(row.e)), kind.floor))
-            n, k, _ = row.J.shape
-            own = np.asarray(row.own) if np.ndim(row.own) else np.full(n, row.own)
-            if own.ndim == 1:
-                W = 1.0 / (own[:, None] + sigmas[i] ** 2)
-                We, WJ = W * row.e, W[:, :, None] * row.J
+            whole = isinstance(row.own, np.ndarray) and row.own.ndim == 3
+            if whole:
+                W = np.linalg.inv(row.own + sigmas[i] ** 2 * np.eye(row.J.shape[1]))
+                square = np.vecdot(row.e, (W @ row.e[:, :, None])[:, :, 0])
             else:
-                W = np.asarray(np.linalg.inv(own + sigmas[i] ** 2 * np.eye(k)), dtype=float)
-                We, WJ = (W @ row.e[:, :, None])[:, :, 0], W @ row.J
-            square = (row.e * We).sum(axis=1)
+                W = 1.0 / (np.reshape(row.own, (-1, 1, 1)) + sigmas[i] ** 2)
+                square = np.vecdot(row.e, row.e) * W[:, 0, 0]
             w = kind.loss(square, kind.rank)
-            J = (w[:, None, None] * row.J).reshape(-1, m)
-            parts.append(J.T @ WJ.reshape(-1, m))
+            wW = w[:, None, None] * W
+            WJ = (wW @ row.J if whole else wW * row.J).reshape(-1, m).T
+            parts.append(WJ @ row.J.reshape(-1, m))
             N += parts[-1]
-            g += J.T @ We.ravel()
+            g += WJ @ row.e.ravel()
             squares.append(float(w @ square))
-        unit = np.sqrt(np.where(np.diag(N) > 0.0, np.diag(N), 1.0))
-        values, vectors = np.linalg.eigh(N / np.outer(unit, unit))
+        own = N.diagonal()
+        unit = np.sqrt(np.where(own > 0.0, own, 1.0))
+        values, vectors = np.linalg.eigh(N / unit / unit[:, None])
         clear = values > _SINGULAR * values[-1]
         U = vectors[:, clear] / unit[:, None]
         V = (U / values[clear]) @ U.T
         step = -V @ g
         at = at.moved(step)
         spare = [
-            max(kind.rank * len(row.e) - float((V * part).sum()), 0.3)  # a part of one number: no division by zero
+            max(kind.rank * len(row.e) - float(np.vdot(V, part)), 0.3)  # a part of one number: no division by zero
             for kind, row, part in zip(kinds, seen, parts, strict=True)
         ]
         change = 0.0

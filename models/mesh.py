@@ -100,6 +100,10 @@ class TriMesh:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "triangles", triangles)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the scenes, which cannot be sent to another process."""
+        return {name: value for name, value in vars(self).items() if name not in ("scene", "_short")}
+
     @cached_property
     def area_vectors(self) -> Floats:
         """(M,3) outward normals whose lengths are the triangle areas, m^2."""
@@ -134,11 +138,15 @@ class TriMesh:
         corners = np.concatenate(done).reshape(-1, 3)
         return TriMesh(corners, np.arange(len(corners)))
 
-    def distances(self, points: Floats) -> Floats:
-        """Distances (N,) m of points (N,3) m from the surface, negative inside where the mesh is closed."""
+    @cached_property
+    def _short(self) -> TriMesh:
+        return self.split(_LONGEST_M)
+
+    def distances(self, points: Floats, signed: bool = True) -> Floats:
+        """Distances (N,) m of points (N,3) m from the surface; `signed`: negative inside where the mesh is closed."""
         query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
-        found = np.asarray(self.split(_LONGEST_M).scene.compute_distance(query).numpy(), dtype=np.float64)
-        if not self.watertight():
+        found = np.asarray(self._short.scene.compute_distance(query).numpy(), dtype=np.float64)
+        if not signed or not self.watertight():
             return found
         # the majority of three rays decides on which side a point lies: one may hit an edge
         return np.where(self.scene.compute_occupancy(query, nsamples=3).numpy() > 0.5, -found, found)

@@ -5,13 +5,11 @@ z).
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh
 
 Floats = NDArray[np.float64]
 
@@ -43,18 +41,6 @@ class ProfilerPreset:
     def x_m(self) -> Floats:
         """Where the samples lie along the line (samples,)."""
         return np.linspace(-0.5 * self.width_m, 0.5 * self.width_m, self.samples)
-
-
-def make_scene(mesh: TriMesh) -> Any:
-    """Return a mesh made ready for rays: Open3D's RaycastingScene."""
-    from weldcal.models.mesh import o3d  # slow to import
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(np.asarray(mesh.vertices, np.float32)),
-        o3d.core.Tensor.from_numpy(np.asarray(mesh.triangles, np.uint32)),
-    )
-    return scene
 
 
 def with_noise(profiles: Floats, preset: ProfilerPreset, rng: np.random.Generator) -> Floats:

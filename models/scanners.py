@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -372,18 +372,14 @@ def depth_to_points(depth: npt.NDArray[np.floating], fx: float, fy: float, cx: f
 
 def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> Floats:
     """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
-    from weldcal.models.mesh import o3d
+    from weldcal.models.mesh import merge
 
-    tensor: Any = o3d.core.Tensor
-    scene = o3d.t.geometry.RaycastingScene()
-    for mesh in meshes:
-        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
     flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
     rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
     R, eye = X_BC.rotation().matrix(), X_BC.translation()
     rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
     # The rays have unit depth, so what the caster calls distance is depth.
-    depth = scene.cast_rays(tensor(rays))["t_hit"].numpy()
+    depth = merge(*meshes).scene.cast_rays(rays)["t_hit"].numpy()
     depth[~np.isfinite(depth)] = 0.0
     measured = apply_noise(depth, scanner, np.random.default_rng(seed))
     points_C = depth_to_points(measured, scanner.fx, scanner.fy, scanner.cx, scanner.cy)

@@ -60,17 +60,17 @@ class CalibrationEstimate:
 
 
 def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
-    """Return the covariance (3, 3) m^2, in B, of the base position of a scanned point at ``p_BQ`` (3,) m.
+    """Return the covariance (..., 3, 3) m^2, in B, of the base positions of scanned points at ``p_BQ`` (..., 3) m.
 
     With a scanner correction, X_BC and correction err together: where both were seen, much of either cancels.
     """
     p = np.asarray(p_BQ, dtype=float)
-    J = np.hstack([-skew(p - estimate.X_BC.translation()), np.eye(3)])
+    R, along = estimate.X_BC.rotation().matrix(), p - estimate.X_BC.translation()
+    J = np.concatenate([-skew(along), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
     if estimate.joint is None or estimate.scanner is None:
-        return np.asarray(J @ estimate.covariance @ J.T)
-    c = np.asarray(estimate.X_BC.inverse() @ p)
-    J = np.hstack([J, np.outer(estimate.X_BC.rotation() @ c, estimate.scanner.terms(c))])
-    return np.asarray(J @ estimate.joint @ J.T)
+        return np.asarray(J @ estimate.covariance @ np.swapaxes(J, -1, -2))
+    J = np.concatenate([J, along[..., :, None] * estimate.scanner.terms(along @ R)[..., None, :]], axis=-1)
+    return np.asarray(J @ estimate.joint @ np.swapaxes(J, -1, -2))
 
 
 def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:

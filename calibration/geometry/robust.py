@@ -11,7 +11,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtr, chdtri, fdtrc, fdtri, gammaincinv, stdtrit
 
 from weldcal.models.arrays import Array
@@ -212,6 +211,8 @@ def find_order(ours: Sequence[Array], theirs: Sequence[Array], solve: Solve, pos
 
 
 def _assigned(cost: Array) -> Pairs:
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     rows, columns = linear_sum_assignment(cost)
     return np.asarray(rows, dtype=np.int64), np.asarray(columns, dtype=np.int64)
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
 from weldcal.models.mesh import TriMesh
-from weldcal.models.profilers import make_scene
 
 TOOL = 7  # bodies of the tool: on the flange, one link further than wrist 3
 STANDING = (0, 1)  # links: base and shoulder stand on the table by design
@@ -167,28 +165,20 @@ class Obstacle:
     margin_m: float = 0.0
 
     @cached_property
-    def _scene(self) -> Any:
-        return make_scene(self.mesh)
-
-    @cached_property
     def _closed(self) -> bool:
         return self.mesh.watertight()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the scene, which cannot be sent to another process."""
-        return {name: value for name, value in vars(self).items() if name != "_scene"}
 
     def distance(self, points: Array) -> Array:
         """Distance (N,) m of points (N, 3); inside a closed surface it is negative."""
         query = np.ascontiguousarray(points, dtype=np.float32)
         if self._closed:
-            return np.asarray(self._scene.compute_signed_distance(query).numpy(), dtype=float)
-        return np.asarray(self._scene.compute_distance(query).numpy(), dtype=float)
+            return np.asarray(self.mesh.scene.compute_signed_distance(query).numpy(), dtype=float)
+        return np.asarray(self.mesh.scene.compute_distance(query).numpy(), dtype=float)
 
     def blocks(self, eye: Array, targets: Array) -> bool:
         """Return whether a line of sight from the eye (3,) to one of the targets (N, 3) meets the surface."""
         rays = np.hstack([np.broadcast_to(eye, targets.shape), targets - eye]).astype(np.float32)
-        return bool((self._scene.cast_rays(np.ascontiguousarray(rays))["t_hit"].numpy() < 1.0).any())
+        return bool((self.mesh.scene.cast_rays(np.ascontiguousarray(rays))["t_hit"].numpy() < 1.0).any())
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ CHORD_MM, FACET_RAD = 0.02, 0.05  # largest distance and angle between the mesh 
 LEAST_EDGE_MM = 1e-6
 SEWN_MM = 0.1  # between surfaces that are sewn: below the gap that a weld notices
 SMOOTH_RAD = math.radians(2.0)
+_ON_M = 5e-5  # how far a line's middle may lie from the edge that it is: a choice, above the error of an edge's chords
 _MERGED_M = 1e-7
 _EXTERNAL = re.compile(
     rb"DOCUMENT_FILE\s*\(\s*'([^']*\.st(?:e?p))'", re.IGNORECASE
@@ -370,15 +371,19 @@ def with_joints(
 
     known, joints = list(edges), []
     ends = np.array([edge.points_P[[0, -1]] for edge in edges]).reshape(-1, 2, 3)
-    closed = np.array([edge.closed for edge in edges], dtype=bool)
+    closed, lengths = np.array([(edge.closed, edge.length_m) for edge in edges]).reshape(-1, 2).T
+    boxes = np.array([(edge.points_P.min(axis=0), edge.points_P.max(axis=0)) for edge in edges]).reshape(-1, 2, 3)
     for chain in chains:
         ids = []
         for piece in chain:
             kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
             line = 1e-3 * piece.line
             apart = [np.abs(ends - line[some]).max(axis=(1, 2)) for some in ([0, -1], [-1, 0])]
-            near = np.flatnonzero(closed | (np.minimum(*apart) < 2e-5)).tolist()
-            lies = (k for k in near if known[k].up_P is None and _is(known[k], line))
+            near = ((closed > 0.0) | (np.minimum(*apart) < 2e-5)) & (np.abs(lengths - length_of(line)) <= 2e-5)
+            beyond = np.maximum(boxes[:, 0] - _middle(line), _middle(line) - boxes[:, 1]).max(axis=1)
+            lies = (
+                int(k) for k in np.flatnonzero(near & (beyond < _ON_M)) if known[k].up_P is None and _is(known[k], line)
+            )
             at = next(lies, len(known))
             radius = known[at].radius_m if at < len(known) else None
             line = known[at].points_P if at < len(known) else 1e-3 * piece.line
@@ -404,18 +409,17 @@ def with_joints(
 
 
 def _is(edge: PartEdge, line: Floats) -> bool:
-    """Return whether an edge is this line (N,3) m."""
-    from weldcal.models.workpieces.brep import length_of
-
-    p, q = edge.points_P, line
+    """Return whether an edge of this length is this line (N,3) m."""
+    p, q, middle = edge.points_P, line, _middle(line)
     ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
-    if not (ends < 2e-5 or edge.closed) or abs(edge.length_m - length_of(q)) > 2e-5:
-        return False
-    middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
     a, d = p[:-1], np.diff(p, axis=0)
     share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)
     off = float(np.linalg.norm(a + share[:, None] * d - middle, axis=1).min())
-    return bool((ends < 2e-5 or (edge.closed and np.linalg.norm(q[0] - q[-1]) < 1e-5)) and off < 5e-5)
+    return bool((ends < 2e-5 or (edge.closed and np.linalg.norm(q[0] - q[-1]) < 1e-5)) and off < _ON_M)
+
+
+def _middle(line: Floats) -> Floats:
+    return np.asarray(0.5 * (line[0] + line[-1]) if len(line) == 2 else line[len(line) // 2])
 
 
 def _first_line(error: Exception) -> str:

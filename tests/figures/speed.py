@@ -18,7 +18,8 @@ from weldcal.models.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOTS, BOARD = 50, "chessboard:9x6:20"
-KNOWN = ("demo", "calibrate", "part", "hand-eye")
+KNOWN = ("demo", "calibrate", "part", "seams", "hand-eye")
+BRACKETS = 38  # of the assembly whose seams are listed, with 1,000 edges
 
 
 @contextmanager
@@ -51,11 +52,13 @@ def write_inputs(folder: Path, names: Sequence[str]) -> dict[str, list[str]]:
     calls = {"demo": ["demo", "--no-browser"]}
     if "calibrate" in names:
         calls["calibrate"] = ["calibrate", str(write_example(folder / "scans"))]
-    if "part" in names:
-        from tests.worlds.parts.step_parts import assembly, box, write_step
+    if {"part", "seams"} & set(names):
+        from tests.worlds.parts.step_parts import assembly, box, brackets_on_plate, write_step
 
         write_step(assembly(box((0, 0, -10), (200, 100, 10)), box((0, 46, 0), (200, 8, 60))), folder / "boxes.step")
         calls["part"] = ["part", str(folder / "boxes.step")]
+        write_step(brackets_on_plate(BRACKETS), folder / "brackets.step")
+        calls["seams"] = ["part", str(folder / "brackets.step"), "--plan", "0"]
     if "hand-eye" in names:
         from tests.calibration.hand_eye import rendering
 

@@ -16,7 +16,6 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
-from weldcal.models.profilers import make_scene
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
 from weldcal.systems.drivers.simulated.ur import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
@@ -242,7 +241,7 @@ def _ball(radius: float, rings: int = 25) -> TriMesh:
 
 def cast(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
     """Return the frame that the scanner returns of these bodies."""
-    scene = make_scene(merge(*bodies))
+    scene = merge(*bodies).scene
     rays = np.zeros((scanner.height, scanner.width, 6), dtype=np.float32)
     rays[..., 3] = ((np.arange(scanner.width) - scanner.cx) / scanner.fx)[None, :]
     rays[..., 4] = ((np.arange(scanner.height) - scanner.cy) / scanner.fy)[:, None]

@@ -23,7 +23,7 @@ from weldcal.models.arms.dh import dh_parameters
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, o3d
-from weldcal.models.profilers import ProfilerPreset, make_scene
+from weldcal.models.profilers import ProfilerPreset
 
 RADIUS_M = 0.020
 SAMPLES = 120
@@ -396,7 +396,7 @@ def _seen(
     """Return profiles (n, m, 2) without noise, of a mesh at X_BP = (turn, place)."""
     R = np.einsum("ji,njk->nik", turn, X.rotation @ world.rotation)
     o = (X.rotation @ world.translation + X.translation - place) @ turn
-    return cast_profiles(make_scene(mesh), R, o, preset)
+    return cast_profiles(mesh.scene, R, o, preset)
 
 
 def scan_groove(

@@ -415,17 +415,13 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
     weak, least = weakest_place(estimate, p_B), 1e3 * sigma_at(estimate, middle)
     figure = Figure(figsize=(8.2, 4.0), layout="constrained")
     levels = least * np.linspace(0.95, _WIDEST, 9)
-    drawn = None
     all_axes = figure.subplots(1, 2)
     for axes, (i, j), title in zip(all_axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         reach = 0.5 * extent * (1.0 + 2.0 * _MARGIN)
         u, v = (np.linspace(-reach, reach, _STEPS) + middle[k] for k in (i, j))
-        sigma = np.empty((_STEPS, _STEPS))
-        for row, b in enumerate(v):
-            for column, a in enumerate(u):
-                p = middle.copy()
-                p[i], p[j] = a, b
-                sigma[row, column] = 1e3 * sigma_at(estimate, p)
+        p = np.tile(middle, (_STEPS, _STEPS, 1))
+        p[..., i], p[..., j] = u, v[:, None]
+        sigma = 1e3 * np.sqrt(np.trace(point_error_covariance(estimate, p), axis1=-2, axis2=-1))
         drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
         for at, mark, size, colour, label in (
             (p_B, "o", 5, "white", "poses taken"),
@@ -436,7 +432,6 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
         axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")
-    assert drawn is not None
     bar = figure.colorbar(drawn, ax=all_axes, shrink=0.85, format="%.3g")
     bar.set_label("one sigma of a scanned point, mm")
     all_axes[0].legend(fontsize=8, loc="lower left", framealpha=0.9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import matplotlib
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -121,6 +122,7 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
     figure = Figure(figsize=(8.2, 1.5 * rows + 0.1), layout="constrained")
     for axes, id in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, ids):
         axes.set_axis_off()
+        axes.set(xticks=[], yticks=[])
         if id is None:
             continue
         fit = fits[id]
@@ -132,7 +134,7 @@ def scan_pictures(clouds: Mapping[str, Array], fits: Mapping[str, FlangeFit]) ->
                 axes.add_patch(Circle((0.0, 0.0), 1e3 * radius, fill=False, color="#111", linewidth=0.8))
         axes.plot(0.0, 0.0, "+", color="#111", markersize=5, markeredgewidth=0.8)
         axes.set_aspect("equal")
-        axes.set_title(id, fontsize=7, pad=2)
+        axes.set_title(id, fontsize=7, pad=2, y=1.0)  # where it would be found, among ticks that are not drawn
     return png(figure)
 
 
@@ -163,9 +165,7 @@ def plain(axes: Axes, x: str, y: str) -> None:
 
 def png(figure: Figure) -> bytes:
     """Return the figure as PNG, the same bytes for the same data."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=120, metadata={"Software": None}, facecolor="white")
-    return stream.getvalue()
+    return _saved(figure, 120, FigureCanvasAgg(figure).print_png, {"Software": None})
 
 
 def svg(figure: Figure, *all_axes: Axes) -> bytes:
@@ -174,13 +174,15 @@ def svg(figure: Figure, *all_axes: Axes) -> bytes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e6e9", linewidth=0.8)
         axes.set_axisbelow(True)
-    stream = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "weldcal", "svg.fonttype": "path"}):
-        # laid out here, savefig does not draw the whole figure once more only for its layout
-        FigureCanvasSVG(figure)
-        figure.dpi = FigureCanvasSVG.fixed_dpi
-        if (layout := figure.get_layout_engine()) is not None:
-            layout.execute(figure)
-            figure.set_layout_engine("none")
-        figure.savefig(stream, format="svg", metadata={"Date": None}, facecolor="white")
+        return _saved(figure, FigureCanvasSVG.fixed_dpi, FigureCanvasSVG(figure).print_svg, {"Date": None})
+
+
+def _saved(figure: Figure, dpi: float, save: Callable[..., None], metadata: dict[str, None]) -> bytes:
+    """Lay the figure out and save it: savefig would draw the whole figure once more only for its layout."""
+    figure.dpi = dpi
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+    save(stream := io.BytesIO(), metadata=metadata)
     return stream.getvalue()

@@ -28,10 +28,10 @@ BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between 
 ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
 STEP_M = 0.02  # along the seam; the tool, 20 mm and more wide, meets every place between
-SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
 # From the part's surface: above a scan's noise and the registration's error, below the height of a tack, 3 mm and more.
 OTHER_M = 0.0025
-SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
+CELL_M, MOST_CELLS = 0.010, 1 << 20  # of points that are far from the tool together: a choice; cells along an axis
+FEW = 1_000  # points whose median distance to the next is that of all within some hundredths
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
 BLOCK_M = 0.005  # a choice: twice OTHER_M, on top of what the tool reaches below the table
@@ -122,28 +122,33 @@ def check_beside(
     lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
     places = [(float(s), 0.0) for s in steps] + [(s, float(lift)) for s in (from_m, last) for lift in lifts]
     held = [(s, lift, *_held(seam, s, tool.chord_m, lean_rad)) for s, lift in places]
-    share = np.linspace(0.0, 1.0, SPHERES)[:, None]
-    body = np.vstack([a + share * (b - a) for a, b, _ in spans])
-    swept = cKDTree(np.vstack([tip.position + (body + lift * upward / NEAR_TIP_M) @ R.T for _, lift, tip, R in held]))
-    reach = max(radius for _, _, radius in spans) + STEP_BESIDE_M
-    near = _boxed(points_B, np.asarray(swept.data), reach)
-    near = near[np.asarray(swept.query(near, distance_upper_bound=reach)[0]) < reach]
+    ends = [tip.position + (np.add((a, b), [0.0, 0.0, up])) @ R.T for _, up, tip, R in held for a, b, _ in spans]
+    near = _boxed(points_B, np.vstack(ends), max(radius for _, _, radius in spans))
     if len(near) < 2:
         return
-    samples = _boxed(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0], near, 2.0 * OTHER_M)
-    surface = cKDTree(samples, balanced_tree=False, compact_nodes=False)
-    pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
-    other = near[np.asarray(surface.query(near, distance_upper_bound=2.0 * OTHER_M)[0]) > OTHER_M]
+    pitch = float(np.median(np.asarray(cKDTree(near).query(near[:: max(1, len(near) // FEW)], k=2)[0])[:, 1]))
+    low = near.min(axis=0)
+    corners = np.floor((near - low) / CELL_M).astype(np.int64)
+    cells, cell = np.unique(corners @ (MOST_CELLS ** np.arange(3)), return_inverse=True)
+    middles = low + CELL_M * (0.5 + cells[:, None] // MOST_CELLS ** np.arange(3) % MOST_CELLS)
+    wide = 0.5 * math.sqrt(3.0) * CELL_M
+    reached = [
+        [_distances((middles - tip.position) @ R - [0.0, 0.0, lift], a, b) < radius + wide for a, b, radius in spans]
+        for _, lift, tip, R in held
+    ]
+    kept = np.any(reached, axis=(0, 1))[cell]
+    X_PB = X_BP.inverse()
+    kept[kept] = mesh.distances(near[kept] @ X_PB.rotation().matrix().T + X_PB.translation(), signed=False) > OTHER_M
+    other, cell = near[kept], cell[kept]
     flat = other[:, 2] < table_z_m + OTHER_M
     least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
     before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
-    for s, lift, tip, R in held:
-        points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
+    for (s, lift, tip, R), cells_met in zip(held, reached, strict=True):
         for k, (a, b, radius) in enumerate(spans):
-            met = np.flatnonzero(_distances(points_T, a, b) < radius)
-            if k >= len(
-                above
-            ):  # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+            met = np.flatnonzero(cells_met[k][cell])
+            met = met[_distances((other[met] - tip.position) @ R - [0.0, 0.0, lift], a, b) < radius]
+            # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+            if k >= len(above):
                 met = met[~flat[met]]
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
             if len(met) and len(both) >= least and stops is not None:
@@ -304,6 +309,6 @@ def _above_tip(capsule: Capsule, X_FT: RigidTransform) -> tuple[Array, Array, fl
 
 
 def _distances(points: NDArray[np.float64], a: Array, b: Array) -> Array:
-    d = b - a
-    share = np.clip((points - a) @ d / max(float(d @ d), 1e-12), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(points - a - share[:, None] * d, axis=1))
+    d, q = b - a, points - a
+    q -= np.clip(q @ d / max(float(d @ d), 1e-12), 0.0, 1.0)[:, None] * d
+    return np.asarray(np.sqrt(np.vecdot(q, q)))

@@ -18,7 +18,6 @@ from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
-from weldcal.models.profilers import make_scene
 from weldcal.tools.report.render import csv_text
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "aubo_i5", "franka_fr3")
@@ -182,7 +181,7 @@ def render(mesh: TriMesh, X_BC: RigidTransform, rng: np.random.Generator, sigma:
     u, v = np.meshgrid((np.arange(WIDTH) - 0.5 * WIDTH) / FOCAL, (np.arange(HEIGHT) - 0.5 * HEIGHT) / FOCAL)
     rays_C = np.stack([u, v, np.ones_like(u)], axis=-1)
     d = rays_C @ X_BC.rotation().matrix().T
-    scene = make_scene(mesh)
+    scene = mesh.scene
     rays = np.concatenate([np.broadcast_to(X_BC.translation(), d.shape), d], axis=-1).astype(np.float32)
     hit = scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), nthreads=1)
     z = hit["t_hit"].numpy().astype(float)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from tests.worlds.parts.step_parts import PARTS
+from tests.worlds.parts.step_parts import PARTS, brackets_on_plate, write_step
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces import step
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.shape import PartEdge
 from weldcal.models.workpieces.step import CHORD_MM
 
 if TYPE_CHECKING:
@@ -203,3 +207,23 @@ def test_a_bowed_part_takes_its_seam_along(shelf: Shelf) -> None:
     again = draw_seam(out.mesh, out.seam_P, "fillet")
     gap = np.linalg.norm(again.points_P[10:-10, None] - out.seam_P[None], axis=2).min(axis=1)
     assert gap.max() < 0.0003  # half of the points' spacing along the seam
+
+
+def test_edges_of_joints_are_compared_where_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Twice the brackets are twice the comparisons; each edge with each would be four times as many."""
+    compared, found = [0], []
+    same = step._is
+
+    def counted(edge: PartEdge, line: NDArray[np.float64]) -> bool:
+        compared[0] += 1
+        return same(edge, line)
+
+    monkeypatch.setattr(step, "_is", counted)
+    for count in (3, 6):
+        write_step(brackets_on_plate(count), tmp_path / f"{count}.step")
+        compared[0] = 0
+        shape = step.read_step(tmp_path / f"{count}.step", None)
+        found.append((len(shape.joints), compared[0]))
+    (joints, few), (more_joints, more) = found
+    assert more_joints == 2 * joints > 0
+    assert 0 < more < 3 * few

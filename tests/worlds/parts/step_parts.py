@@ -290,6 +290,16 @@ def bevelled_plates() -> MadePart:
     )
 
 
+def brackets_on_plate(count: int) -> Any:
+    """Return an assembly of a plate and so many brackets, each held by two bolts: 12 edges, and 26 for each bracket."""
+    parts = [box((-400, -400, -20), (800, 800, 20))]
+    for k in range(count):
+        x, y = -380 + 90 * (k % 8), -380 + 90 * (k // 8)
+        bolts = [cylinder((x + 35, y + 15 + 20 * i, 0), 5, 20) for i in (0, 1)]
+        parts += [less(fused(box((x, y, 0), (60, 50, 8)), box((x, y, 0), (8, 50, 50))), *bolts), *bolts]
+    return assembly(*parts)
+
+
 def moved(shape: Any, by: Sequence[float]) -> Any:
     """Return a shape moved by a vector, mm."""
     from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform

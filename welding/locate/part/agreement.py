@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.scan import PreparedScan
 from weldcal.welding.locate.planes import into
 
+Ints = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -38,7 +40,6 @@ class Agreement:
         hidden: something before it is seen.
         seen: share of the part's visible surface with a scan point near.
         goes_on: share of the edges that should end a seen face beyond which the scan shows that face go on.
-        verdict: (N,) of all rays: 1 met, -1 passed, 0 else.
     """
 
     met: float
@@ -47,7 +48,6 @@ class Agreement:
     seen: float
     n_met: int
     goes_on: float
-    verdict: npt.NDArray[np.int8]
 
     @property
     def score(self) -> float:
@@ -61,42 +61,48 @@ class Agreement:
         return max(0.0, met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
 
 
-def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
-    """Select the rays (N,6) that may meet the part near X_BP: the point measured, and the scanner's position."""
+def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Ints:
+    """Select the rays that may meet the part near X_BP: the numbers (N,) of their points in the scan."""
     middle = X_BP.multiply(model.center) - scan.eyes
     far = np.linalg.norm(middle, axis=1)
     sine = np.minimum(1.0, (model.radius + reach_m) / far)
-    towards = (middle / far[:, None])[scan.view]
-    near = np.flatnonzero(np.vecdot(scan.sight, towards) > np.sqrt(1.0 - sine**2)[scan.view])
+    towards, least = (middle / far[:, None]).T, np.sqrt(1.0 - sine**2)
+    near = np.flatnonzero((scan.sight @ towards > least)[np.arange(len(scan.view)), scan.view])
     eye = into(X_BP, scan.eyes)[scan.view[near]]
     d = into(X_BP, scan.points[near]) - eye
     low, high = model.mesh.bounds
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (low - reach_m - eye) / d, (high + reach_m - eye) / d
-    near = near[np.minimum(a, b).max(axis=1) <= np.maximum(a, b).min(axis=1)]
+        a, b = ((low - reach_m - eye) / d).T, ((high + reach_m - eye) / d).T
+    near = near[reduce(np.maximum, np.minimum(a, b)) <= reduce(np.minimum, np.maximum(a, b))]
     stride = max(1.0, len(near) / MOST_RAYS)
-    near = near[(np.arange(int(len(near) / stride)) * stride).astype(int)]
-    return np.hstack([scan.points[near], scan.eyes[scan.view[near]]])
+    return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
 
 
-def agreement(
-    rays: Floats, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float
-) -> Agreement:
-    """Compare these rays (N,6) with the part at X_BP."""
-    points, eye = rays[:, :3], into(X_BP, rays[:, 3:])
-    d = into(X_BP, points) - eye
-    far = np.linalg.norm(d, axis=1)
-    hit, normal = model.ranges(eye, d / far[:, None])
-    cosine = np.abs(np.sum(d * normal, axis=1)) / far
+def cast(rays: Ints, scan: PreparedScan, model: PartModel, X_BP: RigidTransform) -> tuple[Floats, ...]:
+    """Cast rays (N,) at the part at X_BP: d (N,3) m from the scanner, lengths, distances hit (N,) m, normals (N,3)."""
+    eye = into(X_BP, scan.eyes)[scan.view[rays]]
+    d = into(X_BP, scan.points[rays]) - eye
+    far = np.sqrt(np.vecdot(d, d))
+    return d, far, *model.ranges(eye, d / far[:, None])
+
+
+def compared(
+    rays: Ints, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float
+) -> tuple[Mask, Mask, Mask]:
+    """Tell which of rays (N,) meet the part at X_BP as predicted, which pass through it, and which end before it."""
+    d, far, hit, normal = cast(rays, scan, model, X_BP)
+    cosine = np.abs(np.vecdot(d, normal)) / far
     # Along a slanted surface the same error of the pose is a larger error of the range.
     slack = tolerance_m / np.maximum(cosine, 0.3)
     meets = np.isfinite(hit) & (cosine > NOT_MEASURED_COS)
     behind = far - hit
-    met = meets & (np.abs(behind) < slack)
-    passed = meets & (behind > slack)
-    hidden = meets & (behind < -slack)
-    total = max(1, int(meets.sum()))
-    verdict = met.astype(np.int8) - passed.astype(np.int8)
+    return meets & (np.abs(behind) < slack), meets & (behind > slack), meets & (behind < -slack)
+
+
+def agreement(rays: Ints, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> Agreement:
+    """Compare these rays (N,) of the scan with the part at X_BP."""
+    met, passed, hidden = compared(rays, scan, model, X_BP, tolerance_m)
+    total = max(1, int(met.sum() + passed.sum() + hidden.sum()))
     # Which of the visible surface the scan shows: rays back to samples of the part.
     s, n = model.points[::12][:VISIBLE_SAMPLES], model.normals[::12][:VISIBLE_SAMPLES]
     visible = np.zeros(len(s), dtype=bool)
@@ -108,8 +114,8 @@ def agreement(
     s = s[visible]
     seen = 0.0
     if len(s) and met.any():
-        spacing = 2.0 * scan.pitch_m * max(1.0, (len(scan.points) / max(1, len(points))) ** 0.5)
-        near, _ = cKDTree(into(X_BP, points[met])).query(s, distance_upper_bound=max(0.005, 2.0 * spacing))
+        spacing = 2.0 * scan.pitch_m * max(1.0, (len(scan.points) / max(1, len(rays))) ** 0.5)
+        near, _ = cKDTree(into(X_BP, scan.points[rays[met]])).query(s, distance_upper_bound=max(0.005, 2.0 * spacing))
         seen = float(np.mean(np.isfinite(near)))
     return Agreement(
         met=float(met.sum() / total),
@@ -118,24 +124,20 @@ def agreement(
         seen=seen,
         n_met=int(met.sum()),
         goes_on=_goes_on(scan, model, X_BP, tolerance_m),
-        verdict=verdict,
     )
 
 
 def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> list[int]:
     """List the scans that show the part's surface near X_BP, but not at it: their pose is wrong."""
     rays = rays_near(scan, model, X_BP)
-    origin = into(X_BP, rays[:, 3:])
-    d = into(X_BP, rays[:, :3]) - origin
-    far = np.linalg.norm(d, axis=1)
-    hit, normal = model.ranges(origin, d / far[:, None])
+    _, far, hit, normal = cast(rays, scan, model, X_BP)
     gap = np.abs(far - hit)
     main = np.argmax(np.abs(normal), axis=1)
     side = 2 * main + (normal[np.arange(len(normal)), main] > 0.0)  # of the six sides of the part
     # A scan that is off along one side agrees at the others: each side is judged by itself where another scan shows it.
     met = np.full((len(scan.eyes), 7), np.nan)
-    for k, eye in enumerate(scan.eyes):
-        own = (rays[:, 3:] == eye).all(axis=1) & (gap < NEAR_M)
+    for k in range(len(scan.eyes)):
+        own = (scan.view[rays] == k) & (gap < NEAR_M)
         for group in range(7):
             chosen = own if group == 6 else own & (side == group)
             if np.count_nonzero(chosen) > LEAST_NEAR:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -59,11 +60,16 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class PartFit:
-    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface."""
+    """A pose with the equations that fixed it, and rms_m of the surface."""
 
     X_BP: RigidTransform
-    covariance: Floats
+    equations: tuple[Equations, Equations | None, float, float]  # of surface and rims, with sigma and point distance, m
     rms_m: float
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """The covariance (6,6) of the motion in P."""
+        return covariance(*self.equations)
 
 
 def moved(X: RigidTransform, xi: Floats) -> RigidTransform:
@@ -114,9 +120,7 @@ def contour(model: PartModel, eye: Floats) -> SharpEdges:
     far = np.linalg.norm(d, axis=1)
     hit, _ = model.ranges(eye, d / far[:, None])
     index = index[hit > far + 0.0025]
-    return SharpEdges(
-        e.point[index], e.tangent[index], e.normal[index], e.outward[index], e.other[index], e.chain[index]
-    )
+    return SharpEdges(*(getattr(e, f.name)[index] for f in fields(e)))
 
 
 _Rows = TypeVar("_Rows", SharpEdges, Equations)
@@ -314,7 +318,7 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> PartFit
     assert surface is not None
     return PartFit(
         X,
-        covariance(surface, rims, sigma, pitch),
+        (surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,13 +44,7 @@ class PartModel:
     """A mesh in frame P, m, prepared for registration."""
 
     def __init__(self, mesh: TriMesh, seed: int = 0) -> None:
-        from weldcal.models.mesh import o3d
-
         self.mesh = mesh
-        tensor: Any = o3d.core.Tensor
-        self._tensor = tensor
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
         self.points, self.normals = mesh.sample(SAMPLES, np.random.default_rng(seed))
         corners, area = mesh.vertices[mesh.triangles], np.linalg.norm(mesh.area_vectors, axis=1)
         self.gravity = np.average(corners.mean(axis=1), axis=0, weights=area)
@@ -60,7 +53,7 @@ class PartModel:
 
     def closest(self, p: Floats) -> tuple[Floats, Floats]:
         """The nearest surface points (N,3) to points (N,3), and the normals (N,3) there."""
-        found = self._scene.compute_closest_points(self._tensor(p.astype(np.float32)))
+        found = self.mesh.scene.compute_closest_points(p.astype(np.float32))
         return (
             found["points"].numpy().astype(np.float64),
             self.smooth_normals[found["primitive_ids"].numpy().astype(np.int64)],
@@ -88,7 +81,7 @@ class PartModel:
     def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
         """Cast rays from eyes (3,) or (N,3) along directions (N,3): distances (N,), inf for a miss, normals (N,3)."""
         rays = np.hstack([np.broadcast_to(eye, directions.shape), directions]).astype(np.float32)
-        hit = self._scene.cast_rays(self._tensor(rays))
+        hit = self.mesh.scene.cast_rays(rays)
         index = hit["primitive_ids"].numpy().astype(np.int64)
         index[index >= len(self.mesh.triangles)] = 0
         return hit["t_hit"].numpy().astype(np.float64), self.mesh.normals[index]

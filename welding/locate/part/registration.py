@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.mesh import TriMesh
-from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
+from weldcal.welding.locate.part.agreement import Agreement, agreement, compared, rays_near, views_off
 from weldcal.welding.locate.part.fit import PartFit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
@@ -260,9 +260,10 @@ def _evidence(
 ) -> tuple[int, int, int]:
     """Numbers of rays that speak for a and for b where the two differ, and of those that meet a."""
     both = [(a.X_BP, model), (b.X_BP, model_b or model)]
-    rays = np.unique(np.vstack([rays_near(scan, m, X) for X, m in both]), axis=0)
-    va, vb = (agreement(rays, scan, m, X, _tolerance(m)).verdict.astype(int) for X, m in both)
-    return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(va == 1))
+    rays = np.unique(np.concatenate([rays_near(scan, m, X) for X, m in both]))
+    met, passed, _ = zip(*(compared(rays, scan, m, X, _tolerance(m)) for X, m in both), strict=True)
+    va, vb = (one.astype(int) - other for one, other in zip(met, passed, strict=True))
+    return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(met[0]))
 
 
 def _better(rival: _Judged, best: _Judged, scan: PreparedScan, model: PartModel) -> bool:

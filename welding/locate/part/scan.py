@@ -81,6 +81,11 @@ class PreparedScan:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
+    def shown(self) -> list[cKDTree]:
+        """The trees of the coarse points in each of the planes."""
+        return [cKDTree(self.coarse[np.abs(self.coarse @ p.normal - p.level) < p.own_m]) for p in self.planes]
+
+    @cached_property
     def sight(self) -> Floats:
         """Unit directions (N,3) from each point's scanner to the points."""
         d = self.points - self.eyes[self.view]

@@ -104,14 +104,13 @@ def grounds(scan: PreparedScan, model: PartModel) -> list[Plane]:
 def sinks(scan: PreparedScan, model: PartModel, X_BP: RigidTransform) -> bool:
     """Whether the part would stick in its ground, its middle beneath a plane that it meets and that is shown there."""
     middle, points = X_BP.multiply(model.center), X_BP.multiply(model.points[::30].T).T
-    for plane in scan.planes:
+    for plane, shown in zip(scan.planes, scan.shown, strict=True):
         if plane.extent_m < GROUND_EXTENT * model.radius or plane.filled < LEAST_FILLED:
             continue
         depth = plane.level - float(middle @ plane.normal)
         if depth < SUNK_M or (points @ plane.normal).max() < plane.level - SAME_HEIGHT_M:
             continue
-        near = scan.coarse[np.linalg.norm(scan.coarse - middle - depth * plane.normal, axis=1) < model.radius]
-        if np.count_nonzero(np.abs(near @ plane.normal - plane.level) < plane.own_m) > LEAST_GROUND:
+        if shown.query_ball_point(middle + depth * plane.normal, model.radius, return_length=True) > LEAST_GROUND:
             return True
     return False
 
