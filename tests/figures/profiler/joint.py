@@ -1,0 +1,205 @@
+"""Edge with a break, sphere and planes of one mounting: whether the joint region is right, and disagreement is named.
+
+Everything is made by rays: each sample of a profile is where a ray of the sensor first meets the plate (faces and an
+arc between them), the sphere or a plane. The arm has a wrong table of links; its last row is part of the mounting.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.figures.harness import Run, figure
+from tests.worlds.profiler import CLEAN, DOWN, SphereWorld, looking_down
+from weldcal.calibration.errors import InconsistentData
+from weldcal.calibration.geometry.robust import chi2_quantile
+from weldcal.calibration.geometry.se3 import difference, pose
+from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.combined.planes import plane_scans
+from weldcal.calibration.profiler.combined.scans import FeatureScans
+from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.tools.commands.profiler.edge import edge_shown
+from weldcal.tools.commands.profiler.files import Measurements
+from weldcal.tools.commands.profiler.joint import edge_part, planes_shown, sphere_part
+from weldcal.tools.commands.profiler.result import Sigmas
+
+X_SAMPLES = np.arange(-25e-3, 25e-3, 0.1e-3)
+RADIUS_M = 20e-3
+DISTANCE_M = 0.2  # of the features from the sensor
+FLOOR_M = 15e-3  # of the plate's thickness
+NOISE_M = 0.03e-3
+REPEATED_M = 0.02e-3
+SCANS = (24, 16, 24)  # of edge, sphere and planes
+TILT_DEG, YAW_DEG = 25.0, 50.0
+ARM_M, BREAK_M, TOOL_SIGMAS = (0.05e-3, 0.3e-3), (0.0, 1e-3), (5.0, 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Scans:
+    """Poses as the controller states them, and raw profiles (m, 2) m."""
+
+    poses: FlangePoses
+    profiles: tuple[Floats, ...]
+
+    def with_tool(self, offset: Floats) -> "Scans":
+        """Return the same with another tool active: the stated poses are off by a constant in the flange."""
+        return Scans(
+            FlangePoses(self.poses.rotation, self.poses.translation + self.poses.rotation @ offset), self.profiles
+        )
+
+    @property
+    def file(self) -> Measurements:
+        """The same as a file holds them."""
+        arrays = {"rotation": self.poses.rotation, "translation": self.poses.translation}
+        return Measurements(arrays=arrays, profiles=self.profiles, digest="")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Made:
+    """The scans of a set, X_FS (4, 4), the edge's radius and the arm's error, both m."""
+
+    edge: Scans
+    sphere: Scans
+    planes: tuple[Scans, ...]
+    X_FS: Floats
+    break_m: float
+    arm_m: float
+
+
+def made_set(seed: int) -> Made:
+    """Return a set of a seed."""
+    rng = np.random.default_rng([seed, 62])
+    w = SphereWorld.made(seed, CLEAN)
+    plan = [_edge_views(w, rng), _sphere_views(w, rng), *_plane_views(w, rng)]
+    joints = [w.joints(*w.viewing(R_BS, p_S, at)) for R_BS, p_S, at, _ in plan]
+    arm_m, break_m = rng.uniform(*ARM_M), rng.uniform(*BREAK_M)
+    real = _wrong_arm(w.cell.arm, np.vstack(joints), arm_m, rng)
+    scans = []
+    for q, (_, _, _, cut) in zip(joints, plan, strict=True):
+        X, profiles = real.frames(q)[:, 6], []
+        for X_BF in X:
+            X_BS = X_BF @ pose(w.rotation, w.translation)
+            X_BS[:3, 3] += REPEATED_M * rng.standard_normal(3)
+            z = cut(X_BS, break_m)
+            z += NOISE_M * rng.standard_normal(len(z))
+            profiles.append(np.column_stack([X_SAMPLES, z]))
+        believed = w.cell.arm.frames(q)[:, 6]
+        scans.append(Scans(FlangePoses(believed[:, :3, :3], believed[:, :3, 3]), tuple(profiles)))
+    return Made(
+        edge=scans[0],
+        sphere=scans[1],
+        planes=tuple(scans[2:]),
+        X_FS=pose(w.rotation, w.translation),
+        break_m=break_m,
+        arm_m=arm_m,
+    )
+
+
+def _wrong_arm(arm: DhArm, q: Floats, size_m: float, rng: np.random.Generator) -> DhArm:
+    """Return the arm with a wrong table, by which the flange is off by so much (rms) in these joints (n, 6)."""
+    off = rng.standard_normal((6, 4)) * [1.0, 1.0, 1.0, 1.0]
+    off[5] = 0.0
+    scale = 1e-6
+    for _ in range(3):
+        d = DhArm(arm.rows + scale * off).frames(q)[:, 6, :3, 3] - arm.frames(q)[:, 6, :3, 3]
+        scale *= size_m / float(np.sqrt((d**2).sum(axis=1).mean()))
+    return DhArm(arm.rows + scale * off)
+
+
+def _rays(X_BS: Floats) -> tuple[Floats, Floats]:
+    """Origins (n, 3) of the sensor's rays in B, and their direction (3,)."""
+    return np.outer(X_SAMPLES, X_BS[:3, 0]) + X_BS[:3, 3], X_BS[:3, 2]
+
+
+def _edge_views(w: SphereWorld, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+    """A plate's long edge: the sensor looks over the near face, the side face is hidden."""
+    n, centre = SCANS[0], w.cell.center + rng.uniform(-0.15, 0.15, 3) * [1.0, 1.0, 0.3]
+    turn = Rotation.from_euler("ZYX", rng.uniform(-1, 1, 3) * [180.0, 8.0, 8.0], degrees=True).as_matrix()
+    inward, along, up = turn.T if False else (turn[:, 0], turn[:, 1], turn[:, 2])
+    base = np.column_stack([inward, -along, -up])  # x over the near face, z down
+    angles = np.column_stack(
+        [rng.uniform(-YAW_DEG, YAW_DEG, n), rng.uniform(-32.0, -2.0, n), rng.uniform(-TILT_DEG, TILT_DEG, n)]
+    )
+    R_BS = base @ Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+    p_S = np.column_stack([rng.uniform(-15e-3, 8e-3, n), np.zeros(n), DISTANCE_M + rng.uniform(-20e-3, 20e-3, n)])
+    at = centre + rng.uniform(-40e-3, 40e-3, (n, 1)) * along
+
+    def cut(X_BS: Floats, r: float) -> Floats:
+        o, d = _rays(X_BS)
+        u, h, v, k = (o - centre) @ inward, (o - centre) @ up, d @ inward, d @ up
+        nearest = np.full(len(u), np.inf)
+        for s, hits in (
+            (-h / k, lambda s: u + s * v >= r),
+            ((-u / v if v else np.full(len(u), np.nan)), lambda s: (h + s * k <= -r) & (h + s * k >= -FLOOR_M)),
+            ((-FLOOR_M - h) / k * np.ones(len(u)) if True else None, lambda s: u + s * v <= 0.0),
+        ) if False else (
+            (-h / k, lambda s: u + s * v >= r),
+            (-u / v, lambda s: (h + s * k <= -r) & (h + s * k >= -FLOOR_M)),
+            ((-FLOOR_M - h) / k, lambda s: u + s * v <= 0.0),
+        ):
+            good = (s > 0.0) & hits(s)
+            nearest = np.where(good, np.minimum(nearest, s), nearest)
+        if r > 0.0:  # the arc about (r, -r), where it is outside of both faces
+            a, b, c = v**2 + k**2, (u - r) * v + (h + r) * k, (u - r) ** 2 + (h + r) ** 2 - r**2
+            with np.errstate(invalid="ignore"):
+                s = (-b - np.sqrt(b**2 - a * c)) / a
+            good = (u + s * v < r) & (h + s * k > -r)
+            nearest = np.where(good, np.minimum(nearest, s), nearest)
+        return np.where(np.isfinite(nearest), nearest, np.nan)
+
+    return R_BS, p_S, at, cut
+
+
+def _sphere_views(w: SphereWorld, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+    n, centre = SCANS[1], w.cell.center + rng.uniform(-0.15, 0.15, 3) * [1.0, 1.0, 0.3]
+    R_BS = looking_down(rng, n, TILT_DEG, YAW_DEG)
+    p_S = np.column_stack(
+        [rng.uniform(-6e-3, 6e-3, n), rng.uniform(-0.7, 0.7, n) * RADIUS_M, DISTANCE_M + rng.uniform(-20e-3, 20e-3, n)]
+    )
+
+    def cut(X_BS: Floats, r: float) -> Floats:
+        o, d = _rays(X_BS)
+        b, c = (o - centre) @ d, ((o - centre) ** 2).sum(axis=1) - RADIUS_M**2
+        with np.errstate(invalid="ignore"):
+            s = -b - np.sqrt(b**2 - c)
+            n = (o + s[:, None] * d - centre) / RADIUS_M
+            return np.where(-n @ d > np.cos(np.radians(65.0)), s, np.nan)
+
+    return R_BS, p_S, np.tile(centre, (n, 1)), cut
+
+
+def _plane_views(w: SphereWorld, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+    """Three planes: one level, two tilted by 30 deg about two axes."""
+    n = SCANS[2] // 3
+    for angles in ([0.0, 0.0], [30.0, 0.0], [0.0, -30.0]):
+        centre = w.cell.center + rng.uniform(-0.15, 0.15, 3) * [1.0, 1.0, 0.3]
+        turn = Rotation.from_euler("yx", np.array(angles) + rng.uniform(-5, 5, 2), degrees=True).as_matrix()
+        normal = turn[:, 2]
+        R_BS = turn @ looking_down(rng, n, TILT_DEG, YAW_DEG)
+        p_S = np.column_stack([np.zeros((n, 2)), DISTANCE_M + rng.uniform(-20e-3, 20e-3, n)])
+        at = centre + rng.uniform(-30e-3, 30e-3, (n, 2)) @ turn[:, :2].T
+
+        def cut(X_BS: Floats, r: float, centre: Floats = centre, normal: Floats = normal) -> Floats:
+            o, d = _rays(X_BS)
+            return -((o - centre) @ normal) / (d @ normal)
+
+        yield R_BS, p_S, at, cut
+
+
+def parts_of(made: Made) -> list[FeatureScans]:
+    """Return the scans of a set as the command reduces them."""
+    origin, sigmas = np.array([0.0, DISTANCE_M]), Sigmas(stated=False)
+    shown = edge_shown(made.edge.file, sigmas, "bar", "left", "away")
+    arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in made.sphere.profiles)
+    sphere = SphereData(poses=made.sphere.poses, profiles=arcs, radius_m=RADIUS_M)
+    planes = planes_shown([one.file for one in made.planes])
+    parts = [edge_part(shown, sigmas, "bar", "left", origin), sphere_part(sphere, SphereSigmas(), origin)]
+    return [*parts, plane_scans(planes.poses, planes.profiles, planes.of, origin, parts[1].X_FS)]
+
+
+def square_of(e: JointEstimate, X_FS: Floats) -> float:
+    """Return the squared Mahalanobis distance of the truth."""
+    d = difference(pose(e.rotation, e.translation), X_FS)
+    return float(d @ np.linalg.solve(e.covariance, d))
