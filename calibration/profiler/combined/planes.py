@@ -4,7 +4,7 @@ Source: Lembono, Suarez-Ruiz and Pham, SCALAR, 2018 (three planes); Sharifzadeh,
 Computer-Integrated Manufacturing 61 (2020) 101823 (one plane, moved to many tilts).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,12 @@ from weldcal.calibration.profiler.combined.scans import PlaneScans
 from weldcal.calibration.profiler.edge.features import MINIMUM_RUN, robust_line
 from weldcal.calibration.profiler.edge.joint import cube_rotations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.reading_choice import Fit, ReadingFit
 from weldcal.calibration.profiler.returns import returns_of
 
 MINIMUM_SCANS = 6  # two numbers each, for the six of the pose and three of a plane, and more to judge them
 _MOST = 200  # points of a profile: pairs of them give the line's start
 _ON_LINE = 0.6  # a choice: share of a profile that must lie on one line
-_SAME = 2.0  # a choice: a start whose median residual is larger than the best by more is not polished
 _STEPS = 60
 
 
@@ -84,7 +84,20 @@ def plane_scans(
     return about(X_FS if X_FS is not None else _start(poses, about))
 
 
-def _start(poses: FlangePoses, about) -> Floats:  # type: ignore[no-untyped-def]
+def planes_fit(profiles: Sequence[Floats], of: NDArray[np.intp]) -> Fit:
+    """Return the comparison of readings of the poses by profiles of planes, one for each pose."""
+
+    def fit(poses: FlangePoses) -> ReadingFit:
+        scans = plane_scans(poses, profiles, of, np.zeros(2))
+        assert scans.X_FS is not None
+        R, t = scans.X_FS[:3, :3], scans.X_FS[:3, 3]
+        placed = scans.placed(poses.rotation @ R, poses.rotation @ t + poses.translation, scans.numbers)
+        return ReadingFit(np.mean(placed.e**2, axis=1), 2, 6 + len(scans.numbers), R, t)
+
+    return fit
+
+
+def _start(poses: FlangePoses, about: Callable[[Floats], PlaneScans]) -> Floats:
     """Return X_FS (4, 4) from the 24 orientations of a cube, each with its planes and the position linear in them."""
     found = []
     for R in cube_rotations():

@@ -6,7 +6,7 @@ the adjustment estimates. What is constant in the flange cannot be told from X_F
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import LEVER_M, VAGUE_M, ProfilerEstimate, worst_direction
 
 REPEATED_M = 0.03e-3  # one sigma per axis of a repeatability of 0.05 mm (ISO 9283), as for the sphere alone
-ARM_M = 0.05e-3  # a choice: one sigma of a coefficient; the flange's error is about twice as large per axis
-ARM_NUMBERS = 4.0  # a choice: so many numbers the prior of the arm's variance counts as
+ARM_M = 0.03e-3
+"""Prior sigma of a coefficient: arms whose links are wrong so that the flange is off by 0.1 to 0.3 mm have 0.02 to 0.04."""
+ARM_NUMBERS = 3.0  # a choice: so many numbers the prior of the arm's variance counts as
+ARM_MOST_M = 0.3e-3  # a choice: of a coefficient, of an arm that is off by a millimetre or more
 ARM_REACH_M = 1.0  # the flange turns by its error over this: an arm's angles act at about its reach
 _FREE_M, _FREE_RAD = 0.05, 0.2  # a choice: what a wrong tool may differ by; beyond, parts are compared before
 _FREE_RADIUS_M = 1e-3
@@ -40,15 +42,29 @@ _LIKELY = 0.05  # a choice: another cause is named as well where it is this like
 _STEPS = 60
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Cause:
-    """What could make parts differ: its size in words, its chance if nothing differs, and the parts' names."""
+    """A cause that could make parts differ, fitted with all the rest.
+
+    Attributes:
+        name: shift, turn or sphere radius; part: whose.
+        words: its size; advice: what to do.
+        value: (n,) m or rad in the flange's axes; covariance: (n, n) of it.
+        chance: of a value this large where nothing differs.
+    """
 
     name: str
+    part: str
     words: str
     advice: str
+    value: Floats
+    covariance: Floats
     chance: float
-    sigmas: float
+
+    @property
+    def square(self) -> float:
+        """Squared Mahalanobis distance of the value from nothing."""
+        return float(self.value @ np.linalg.solve(self.covariance, self.value))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,15 +74,22 @@ class JointEstimate(ProfilerEstimate):
     Attributes:
         sensor: (3,) scale and shear about the origin; edge_radius_m: of its break and its sigma, where there is one.
         arm_m: the arm's error at the flange per axis, without what a constant offset takes up.
-        causes: the likely causes of a disagreement, the likeliest first; none where the parts agree.
+        tested: every cause that was tested, the likeliest first.
         odd: scans of each part that are off by more than five sigmas.
     """
 
     sensor: Floats
     arm_m: float
     edge_radius_m: tuple[float, float] | None
-    causes: tuple[Cause, ...] = ()
+    tested: tuple[Cause, ...] = ()
     odd: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """The likeliest cause of a disagreement, and another that is hardly less likely; none where the parts agree."""
+        if not self.tested or self.tested[0].chance > LEVEL / len(self.tested):
+            return ()
+        return tuple(c for c in self.tested if c.chance * _LIKELY <= self.tested[0].chance)[:2]
 
 
 class _Problem:
@@ -114,39 +137,48 @@ class _Problem:
         J[:, 0, 6:][:, self.arm] = np.eye(len(coefficients))
         return [*found, Observed(coefficients[:, None], J)]
 
-    def solved(self, X: Floats, free: tuple[slice, Floats] | None = None, numbers: Floats | None = None) -> Adjusted:
-        """Adjust from X_FS (4, 4), with some numbers free to their sigmas."""
+    def solved(self, X: Floats, numbers: Floats, at: slice | None = None, free: float = 0.0) -> Adjusted:
+        """Adjust from X_FS (4, 4) and numbers, with some of these free to a sigma."""
         sigma = self.sigma.copy()
-        if free is not None:
-            sigma[free[0]] = free[1]
+        if at is not None:
+            sigma[at] = free
         prior = np.diag(1.0 / sigma**2)
         prior[self.sensor, self.sensor] = self.sensor_information
-        return adjust(
-            Unknowns((X,), self.start if numbers is None else numbers),
-            self.rows,
-            self.kinds,
-            prior=prior,
-            mean=self.start,
-            steps=_STEPS,
-        )
+        start = Unknowns((X,), numbers)
+        return adjust(start, self.rows, self.kinds, prior=prior, mean=self.start, steps=_STEPS)
 
-    def tested(self, name: str, advice: str, solved: Adjusted, at: slice, words: str) -> Cause:
-        """Return a cause with the chance that its numbers are as large as they are by chance."""
-        x, k = solved.at.numbers[at] - self.start[at], slice(6 + at.start, 6 + at.stop)
-        C = solved.covariance
+    def tested(self, best: Adjusted, part: int, name: str, at: slice, free: float) -> Cause:
+        """Solve with some numbers of a part free, and return how likely they are as large by chance."""
+        found = self.solved(best.at.poses[0], best.at.numbers, at, free)
+        x, k, C = found.at.numbers[at] - self.start[at], slice(6 + at.start, 6 + at.stop), found.covariance
         W = np.linalg.inv(C[k, k])
         square = float(x @ W @ x)
         # Yao, Biometrika 52 (1965): each spread counts as it contributes to this distance
-        parts = [float(x @ W @ (C @ N @ C)[k, k] @ W @ x) / max(square, 1e-300) for N in solved.of]
-        spare = [*solved.spare[:-1], solved.spare[-1] + ARM_NUMBERS]
-        few = sum(part**2 / s for part, s in zip(parts, spare, strict=True))
-        n = len(x)
+        shares = [float(x @ W @ (C @ N @ C)[k, k] @ W @ x) / max(square, 1e-300) for N in found.of]  # 1e-300: no zero
+        spare = [*found.spare[:-1], found.spare[-1] + ARM_NUMBERS]
+        few = sum(share**2 / s for share, s in zip(shares, spare, strict=True))
+        who, scale, unit = self.parts[part].name, *((np.degrees(1.0), "deg") if name == "turn" else (1e3, "mm"))
+        size = ", ".join(
+            f"{scale * v:+.3f} +- {scale * s:.3f}" for v, s in zip(x, np.sqrt(np.diag(C)[k]), strict=True)
+        )
+        if name == "radius":
+            words, advice = f"the sphere's radius is {size} mm more than stated", "measure the sphere's diameter"
+        else:
+            how = f"a {name} of ({size}) {unit} along x, y, z of the flange"
+            other = self.parts[0].name if len(self.parts) == 2 else "other parts"
+            words = f"{who} and {other} differ by {how}"
+            advice = (
+                f"check the tool (TCP) that was active for the {who}{f' and the {other}' if len(self.parts) == 2 else ''}"
+                ", and whether the profiler or its bracket was moved in between"
+            )
         return Cause(
             name=name,
+            part=who,
             words=words,
             advice=advice,
-            chance=float(f_tail(square / n, n, 1.0 / max(few, 1e-6))),
-            sigmas=float(np.sqrt(square)),
+            value=x,
+            covariance=C[k, k],
+            chance=float(f_tail(square / len(x), len(x), 1.0 / max(few, 1e-6))),  # 1e-6: as good as known spreads
         )
 
 
@@ -162,9 +194,10 @@ def arm_terms(poses: FlangePoses, middle: Floats) -> Floats:
 
 
 def _arm(left: Remainder) -> float:
-    """By the coefficients' squares and the prior, each as many numbers as it knows."""
+    """By the coefficients' squares and the prior, each as many numbers as it knows; half of the way, which settles."""
     square = left.sigma**2 * left.weighted + ARM_NUMBERS * ARM_M**2
-    return float(np.sqrt(square / (left.spare + ARM_NUMBERS)))
+    found = min(float(np.sqrt(square / (left.spare + ARM_NUMBERS))), ARM_MOST_M)
+    return float(np.sqrt(left.sigma * found))
 
 
 def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | None = None) -> JointEstimate:
@@ -178,25 +211,23 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
     Raises:
         DegenerateMotion: the scans leave a direction open. InconsistentData: the parts' mountings are far apart.
     """
-    starts = [part.X_FS for part in parts if part.X_FS is not None]
-    X = starts[0]
-    for part in parts:
-        if part.X_FS is not None:
-            _refuse_far(parts[0].name, X, part.name, part.X_FS)
+    starts = [(part.name, part.X_FS) for part in parts if part.X_FS is not None]
+    first, X = starts[0]
+    for name, Y in starts[1:]:
+        _refuse_far(first, X, name, Y)
     problem = _Problem(parts, sensor, arm_m)
-    best = problem.solved(X)
+    best = problem.solved(X, problem.start)
     X = best.at.poses[0]
-    causes = _causes(problem, best) if len(parts) > 1 else []
+    tested = _tested(problem, best)
     C = best.covariance[:6, :6]
     _refuse_open(C, best)
-    widened = max(1.0, causes[0].sigmas ** 2 / 3.0) if causes else 1.0
-    residual, odd, squares, numbers = [], [], 0.0, 0.0
+    residual, odd, squares = [], [], 0.0
     for row, sigma in zip(best.rows[:-1], best.sigmas, strict=False):
         W = np.linalg.inv(row.own + sigma**2 * np.eye(row.e.shape[1]))
         square = np.einsum("ni,nij,nj->n", row.e, W, row.e)
         odd.append(tuple(int(k) for k in np.flatnonzero(square > OUTLIER**2 * row.e.shape[1])))
         residual.append(row.e.ravel())
-        squares, numbers = squares + float(square.sum()), numbers + square.size * row.e.shape[1]
+        squares += float(square.sum())
     e = np.concatenate(residual)
     values = best.at.numbers
     edge = next((own for part, own in zip(parts, problem.own, strict=True) if part.name == "edge"), None)
@@ -204,10 +235,10 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
     if edge is not None and problem.sigma[edge.stop - 1] > EXACT:
         broken = float(values[edge.stop - 1]), float(np.sqrt(best.covariance[5 + edge.stop, 5 + edge.stop]))
     moves = np.concatenate([terms @ values[problem.arm] for terms in problem.terms])
-    return JointEstimate(
+    made = JointEstimate(
         rotation=X[:3, :3],
         translation=X[:3, 3],
-        covariance=widened * C,
+        covariance=C,
         residuals=e,
         inliers=np.ones(len(e), bool),
         rms_m=float(np.sqrt(np.mean(e**2))),
@@ -216,9 +247,11 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
         sensor=values[problem.sensor],
         arm_m=float(np.sqrt(np.mean((moves - moves.mean(axis=0))[:, 3:] ** 2))),
         edge_radius_m=broken,
-        causes=tuple(causes),
+        tested=tuple(tested),
         odd=tuple(odd),
     )
+    # what the parts contradict each other by is in the region as well
+    return replace(made, covariance=C * tested[0].square / len(tested[0].value)) if made.causes else made
 
 
 def _unit(C: Floats) -> Floats:
@@ -250,35 +283,15 @@ def _refuse_open(C: Floats, best: Adjusted) -> None:
         )
 
 
-def _causes(problem: _Problem, best: Adjusted) -> list[Cause]:
-    """Return the likely causes of a disagreement, each solved for with the rest; none where all agree."""
-    parts, X, numbers = problem.parts, best.at.poses[0], best.at.numbers
-    tried: list[Cause] = []
-    # of two, either may be the one that is off: both are one test
-    tested = range(len(parts)) if len(parts) > 2 else [1]
-    for k in tested:
-        name = parts[k].name
-        who = f"the {name}" if len(parts) > 2 else f"{parts[0].name} or {name}"
-        for what, at, free in (
-            ("shift", slice(problem.change[k].start + 3, problem.change[k].stop), np.full(3, _FREE_M)),
-            ("turn", slice(problem.change[k].start, problem.change[k].start + 3), np.full(3, _FREE_RAD)),
-        ):
-            found = problem.solved(X, (at, free), numbers)
-            d = found.at.numbers[at]
-            s = np.sqrt(np.diag(found.covariance)[6 + at.start : 6 + at.stop])
-            scale, unit = (1e3, "mm") if what == "shift" else (np.degrees(1.0), "deg")
-            size = ", ".join(f"{scale * v:+.2f} +- {scale * u:.2f}" for v, u in zip(d, s, strict=True))
-            words = f"a {what} of the {name} by ({size}) {unit} along x, y, z of the flange"
-            advice = f"check the tool (TCP) that was active for {who}, and whether the profiler was moved between them"
-            tried.append(problem.tested("tool", advice, found, at, words))
-    for part, own in zip(parts, problem.own, strict=True):
-        if part.name == "sphere":
-            at = slice(own.stop - 1, own.stop)
-            found = problem.solved(X, (at, np.array([_FREE_RADIUS_M])), numbers)
-            d, s = found.at.numbers[at] - problem.start[at], np.sqrt(found.covariance[6 + at.start, 6 + at.start])
-            words = f"a sphere larger in radius by {1e3 * float(d[0]):+.3f} +- {1e3 * float(s):.3f} mm than stated"
-            tried.append(problem.tested("sphere radius", "measure the sphere's diameter", found, at, words))
-    tried.sort(key=lambda cause: cause.chance)
-    if tried[0].chance > LEVEL / len(tried):
-        return []
-    return [cause for cause in tried if cause.chance * _LIKELY <= max(tried[0].chance, 1e-300)][:2]
+def _tested(problem: _Problem, best: Adjusted) -> list[Cause]:
+    """Return every cause of a disagreement, the likeliest first: tools and mountings of the parts, a sphere's radius."""
+    n, found = len(problem.parts), []
+    for k, part in enumerate(problem.parts):
+        if n > 2 or k:  # of two, either may be the one that is off: both are one test
+            middle = problem.change[k].start + 3
+            found.append(problem.tested(best, k, "shift", slice(middle, middle + 3), _FREE_M))
+            found.append(problem.tested(best, k, "turn", slice(middle - 3, middle), _FREE_RAD))
+        if part.name == "sphere" and n > 1:
+            last = problem.own[k].stop
+            found.append(problem.tested(best, k, "radius", slice(last - 1, last), _FREE_RADIUS_M))
+    return sorted(found, key=lambda cause: cause.chance)

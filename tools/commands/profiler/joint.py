@@ -1,5 +1,6 @@
 """weldcal profiler planes and joint: the pose on the flange from planes, or from edge, sphere and planes together."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.geometry.se3 import pose
-from weldcal.calibration.profiler.combined.planes import line_of, plane_scans
+from weldcal.calibration.profiler.combined.planes import line_of, plane_scans, planes_fit
 from weldcal.calibration.profiler.combined.scans import EdgeScans, FeatureScans, edge_scans, sphere_scans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.depth_sign import WORDS
@@ -20,12 +21,13 @@ from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import sphere_joint
-from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas, corrected
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.edge import SIGMAS_MM, EdgeShown, edge_by_noise, edge_shown
 from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.commands.profiler.result import (
+    PosesOption,
     RadiusOption,
     Sigmas,
     UnitOption,
@@ -40,11 +42,15 @@ from weldcal.tools.commands.profiler.result import (
 from weldcal.tools.commands.profiler.sphere import decided_sphere
 from weldcal.tools.report.first_screen import check_limit
 
+KINDS = ("edge", "sphere", "planes")
 MOST_PLANES = 3
+ARM_LARGE_M = 0.3e-3  # a choice: what arms that are not calibrated are wrong by
 _AFFINE = SphereSigmas().affine
 
 
-def edge_part(shown: EdgeShown, sigmas: Sigmas, feature: str, side: str, origin: Floats) -> EdgeScans:
+def edge_part(
+    shown: EdgeShown, sigmas: Sigmas, feature: str, side: str, origin: Floats, affine: Floats | None = None
+) -> EdgeScans:
     """Return the scans of an edge about its own estimate, without outliers; a break where raw profiles show a corner."""
     poses, points = shown.seen()
     e, sigmas = shown.fit or edge_by_noise(poses, points, sigmas)
@@ -57,7 +63,7 @@ def edge_part(shown: EdgeShown, sigmas: Sigmas, feature: str, side: str, origin:
         )[e.inliers]
     return edge_scans(
         poses[e.inliers],
-        points[e.inliers],
+        points[e.inliers] if affine is None else straightened(points[e.inliers], affine, origin),
         EdgeState(e.rotation, e.translation, e.point, e.direction),
         sigma_xz_m=np.array([sigmas.x_m, sigmas.z_m]),
         origin=origin,
@@ -66,8 +72,12 @@ def edge_part(shown: EdgeShown, sigmas: Sigmas, feature: str, side: str, origin:
     )
 
 
-def sphere_part(data: SphereData, sigmas: SphereSigmas, origin: Floats) -> FeatureScans:
+def sphere_part(
+    data: SphereData, sigmas: SphereSigmas, origin: Floats, affine: Floats | None = None
+) -> FeatureScans:
     """Return the scans of a sphere about its own estimate, without wrong scans."""
+    if affine is not None:
+        data = replace(data, profiles=[straightened(p, affine, origin) for p in data.profiles])
     data = replace(data, touches=None, tip=None, touch_q=None, sensor=None)
     e = sphere_joint(data, "affine", sigmas)
     kept = data.without(*e.wrong_poses)
@@ -115,3 +125,149 @@ def planes_shown(files: Sequence[Measurements]) -> PlanesShown:
     return PlanesShown(
         FlangePoses(np.array(R), np.array(t)), tuple(profiles), np.array([known.index(one) for one in of]), lost
     )
+
+
+def planes_decided(files: Sequence[Measurements], form: str = "") -> list[Measurements]:
+    """Return files of planes with the reading of the poses that a form, or else the first file's planes, select."""
+    first, *rest = [file.with_form(form) for file in files]
+    if len(first.readings) > 1:
+        shown = planes_shown([first.read_as(0)])
+        kept = np.setdiff1d(np.arange(len(first.readings[0].X)), shown.lost)
+        fit = planes_fit(shown.profiles, shown.of)
+        first = first.decided(lambda poses: fit(poses[kept]), "set of planes")
+    if first.readings:
+        rest = [file.with_form(first.readings[0].form) for file in rest]
+    if any(len(file.readings) > 1 for file in rest):
+        raise InputError("The files' poses are in several forms: state it with --as robot-form=FORM.")
+    return [first, *rest]
+
+
+@command(
+    "profiler planes",
+    keys=("robot-form", "pitch", "sensor-correction"),
+    short_help="Calibrate by one to three planes.",
+)
+def planes(
+    call: Call,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Profiles of a plane; a file for each plane.")],
+    unit: UnitOption = None,
+    poses: PosesOption = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate the profiler's pose on the flange by raw profiles of one to three planes, which may lie anywhere."""
+    return _joined(call, [("planes", file) for file in files], unit, poses, limit_mm=limit_mm)
+
+
+@command(
+    "profiler joint",
+    keys=("robot-form", "pitch", "side", "z", "sensor-correction", *SIGMAS_MM),
+    short_help="Calibrate by edge, sphere and planes together.",
+)
+def joint(
+    call: Call,
+    parts: Annotated[
+        list[str],
+        typer.Argument(metavar="KIND:FILE...", help="edge:FILE, sphere:FILE and planes:FILE of one mounting."),
+    ],
+    unit: UnitOption = None,
+    feature: Annotated[str, option("--feature", "KIND", "For an edge's raw profiles: bar, step or apex.")] = "",
+    radius: RadiusOption = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate the profiler's pose on the flange by several features of one mounting, and test whether they agree."""
+    given = [(kind, Path(file)) for kind, _, file in (part.partition(":") for part in parts)]
+    for kind, _ in given:
+        if kind not in KINDS or (kind != "planes" and sum(kind == k for k, _ in given) > 1):
+            raise InputError("Give edge:FILE and sphere:FILE once each at most, and planes:FILE for each plane.")
+    return _joined(call, given, unit, None, feature=feature, radius=radius, limit_mm=limit_mm)
+
+
+def _joined(
+    call: Call,
+    given: Sequence[tuple[str, Path]],
+    unit: str | None,
+    poses: Path | None,
+    *,
+    feature: str = "",
+    radius: float | None = None,
+    limit_mm: float | None,
+) -> Outcome:
+    """Read the files of the parts, solve for one mounting, and write it."""
+    check_limit(limit_mm)
+    r, x, z = (1e-3 * call.reading.get(key, usual) for key, usual in SIGMAS_MM.items())
+    sigmas = Sigmas(r, x, z, stated=any(key in call.reading for key in SIGMAS_MM))
+    read = {kind: [read_measurements(call, f, unit, poses) for k, f in given if k == kind] for kind in KINDS}
+    lost: list[int] = []
+    shown, sphere, data = None, None, [*read["planes"]]
+    if read["edge"]:
+        side = call.reading.get("side", "left")
+        shown = edge_shown(read["edge"][0], sigmas, feature, side, call.reading.get("z", ""))
+        data = [shown.file, *data]
+    if read["sphere"]:
+        radius_m = None if radius is None else 1e-3 * radius
+        file, sphere = decided_sphere(read["sphere"][0], radius_m=radius_m, lost=lost, seed=call.seed)
+        data = [file, *data]
+    flat = None
+    if read["planes"]:
+        form = data[0].readings[0].form if len(data[0].readings) == 1 else ""
+        flat = planes_shown(planes_decided(read["planes"], form))
+    seen = [p for some in (sphere and sphere.profiles, flat and flat.profiles) if some for p in some]
+    seen += [] if shown is None else [shown.points[shown.keep]]
+    whole = np.vstack([p[np.isfinite(p).all(axis=1)] for p in seen])
+    correction = stated_correction(call, seen)
+    origin = whole.mean(axis=0) if correction is None else correction.origin
+    affine, S = (np.zeros(3), _AFFINE**2 * np.eye(3)) if correction is None else (correction.values, correction.covariance)
+    made: list[FeatureScans] = []
+    if shown is not None:
+        made.append(edge_part(shown, sigmas, feature, call.reading.get("side", "left"), origin, affine))
+    if sphere is not None:
+        made.append(sphere_part(sphere, SphereSigmas(sensor_m=z, robot_m=r), origin, affine))
+    if flat is not None:
+        start = made[-1].X_FS if made else None
+        made.append(plane_scans(flat.poses, [straightened(p, affine, origin) for p in flat.profiles], flat.of, origin, start))
+    e = solve_joint(made, S)
+    found = joint_figures(e, made) | {
+        "without_feature": [] if shown is None else shown.lost,
+        "without_sphere": lost,
+        "without_plane": [] if flat is None else flat.lost,
+    }
+    digest = data[0].digest if len(data) == 1 else hashlib.sha256("".join(d.digest for d in data).encode()).hexdigest()
+    record = ProfilerRecord.of("+".join(part.name for part in made) + ", joint", e, found, digest)
+    record = replace(record, affine=affine + e.sensor, origin=origin)
+    name = "+".join(file.name for _, file in given)
+    folder = call.folder("profiler", given[0][1].stem if len(given) == 1 else "joint")
+    file, summary = finish(record, with_warnings(data[0], found), whole, np.zeros(0), name, folder, limit_mm)
+    return outcome_of(call, summary, file)
+
+
+def straightened(p: Floats, affine: Floats, origin: Floats) -> Floats:
+    """Return a profile (n, 2) m as a sensor correction corrects it."""
+    return corrected(p, affine, origin)[:, [0, 2]]
+
+
+def joint_figures(e: JointEstimate, parts: Sequence[FeatureScans]) -> dict[str, Any]:
+    """What a joint solution found, for the JSON object, with what its test of agreement says to do."""
+    found: dict[str, Any] = {"scans": sum(len(part.poses) for part in parts), **figures_of(e)}
+    found["parts"] = {part.name: len(part.poses) for part in parts}
+    found["odd_scans"] = {part.name: list(odd) for part, odd in zip(parts, e.odd, strict=True)}
+    found["arm_mm"] = 1e3 * e.arm_m
+    said = []
+    if e.edge_radius_m is not None:
+        found["edge_radius_mm"], found["edge_radius_sigma_mm"] = (1e3 * v for v in e.edge_radius_m)
+    if e.tested:
+        found["agree"] = not e.causes
+        found["causes"] = [cause.words for cause in e.causes]
+    if e.causes:
+        first, *other = e.causes
+        said.append(
+            f"The parts do not agree: {first.words} (by chance once in {1.0 / max(first.chance, 1e-12):.2g} times)."
+            f" {first.advice[0].upper()}{first.advice[1:]}."
+            + (f" As likely: {other[0].words}; {other[0].advice}." if other else "")
+            + " The uncertainty is enlarged until they do."
+        )
+    if e.arm_m > ARM_LARGE_M:
+        said.append(
+            f"The arm's error changes by {1e3 * e.arm_m:.2f} mm between these poses, more than calibrated arms have:"
+            " check the payload and the TCP, or have the arm's kinematics calibrated."
+        )
+    return found | {"warnings": said}
