@@ -22,6 +22,7 @@ from weldcal.calibration.profiler.returns import returns_of
 MINIMUM_SCANS = 6  # two numbers each, for the six of the pose and three of a plane, and more to judge them
 _MOST = 200  # points of a profile: pairs of them give the line's start
 _ON_LINE = 0.6  # a choice: share of a profile that must lie on one line
+_NOISE_M = 0.5e-3  # a choice: coarse profilers have less; two faces leave more
 _STEPS = 60
 
 
@@ -31,23 +32,19 @@ def line_of(profile: Floats) -> tuple[Floats, float, float]:
     They lie one standard deviation of x on both sides of the middle, where their errors are independent.
 
     Raises:
-        FeatureNotFound: less than 60 % of the profile is one line.
+        FeatureNotFound: less than 60 % of the profile is one line, or it is not straight within 0.5 mm (rms).
     """
     p = returns_of(profile, MINIMUM_RUN, "plane")
     p = p[:: max(1, len(p) // _MOST)]
     a, b, sigma, n = robust_line(p[:, 0], p[:, 1])
-    if n < _ON_LINE * len(p):
+    if n < _ON_LINE * len(p) or sigma > _NOISE_M:
         raise FeatureNotFound("The profile is no single line: bring the plane alone into the laser line.")
     x = p[:, 0].mean() + p[:, 0].std() * np.array([-1.0, 1.0])
     return np.column_stack([x, a + b * x]), sigma * float(np.sqrt(2.0 / n)), sigma
 
 
 def plane_scans(
-    poses: FlangePoses,
-    profiles: Sequence[Floats],
-    of: NDArray[np.intp],
-    origin: Floats,
-    X_FS: Floats | None = None,
+    poses: FlangePoses, profiles: Sequence[Floats], of: NDArray[np.intp], origin: Floats, X_FS: Floats | None = None
 ) -> PlaneScans:
     """Return the scans of planes, of which ``of`` (n,) numbers them from 0, about X_FS (4, 4) or from no start.
 

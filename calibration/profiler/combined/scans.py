@@ -166,7 +166,8 @@ def edge_scans(
     M = poses.rotation @ start.rotation
     break_by, inward = np.zeros(len(points)), np.zeros(3)
     if faces is not None:
-        along = np.einsum("nia,na->ni", M[:, :, [0, 2]], faces) @ (np.eye(3) - np.outer(start.direction, start.direction))
+        across = np.eye(3) - np.outer(start.direction, start.direction)
+        along = np.einsum("nia,na->ni", M[:, :, [0, 2]], faces) @ across
         inward = (along / np.linalg.norm(along, axis=1, keepdims=True)).mean(axis=0)
         inward /= np.linalg.norm(inward)
         rays, down = away * M[:, :, 2], np.cross(start.direction, inward)

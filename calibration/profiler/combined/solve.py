@@ -10,17 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from weldcal.calibration.adjustment import (
-    Adjusted,
-    Kind,
-    Observed,
-    Remainder,
-    Unknowns,
-    adjust,
-    helmert,
-    huber,
-    plain,
-)
+from weldcal.calibration.adjustment import Adjusted, Kind, Observed, Remainder, Unknowns, adjust, helmert, huber, plain
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData
 from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import difference, moved, skew
@@ -87,9 +77,10 @@ class JointEstimate(ProfilerEstimate):
     @property
     def causes(self) -> tuple[Cause, ...]:
         """The likeliest cause of a disagreement, and another that is hardly less likely; none where the parts agree."""
-        if not self.tested or self.tested[0].chance > LEVEL / len(self.tested):
+        if not any(cause.chance < LEVEL / len(self.tested) for cause in self.tested):
             return ()
-        return tuple(c for c in self.tested if c.chance * _LIKELY <= self.tested[0].chance)[:2]
+        first, *others = self.tested
+        return first, *[cause for cause in others if cause.chance * _LIKELY <= first.chance][:1]
 
 
 class _Problem:
@@ -111,7 +102,8 @@ class _Problem:
             self.start[own], self.sigma[own], self.sigma[change] = part.numbers, part.known, EXACT
         self.sensor_information = np.linalg.inv(sensor)
         features = [Kind(rank=float(part.own.shape[1]), loss=huber, spread=helmert, sigma=REPEATED_M) for part in parts]
-        self.kinds = [*features, Kind(rank=1.0, loss=plain, spread=_arm if arm_m is None else None, sigma=arm_m or ARM_M)]
+        arm = Kind(rank=1.0, loss=plain, spread=_arm if arm_m is None else None, sigma=arm_m or ARM_M)
+        self.kinds = [*features, arm]
 
     def rows(self, at: Unknowns) -> list[Observed]:
         """Return the rows of each part, and of the arm's coefficients."""
@@ -137,19 +129,18 @@ class _Problem:
         J[:, 0, 6:][:, self.arm] = np.eye(len(coefficients))
         return [*found, Observed(coefficients[:, None], J)]
 
-    def solved(self, X: Floats, numbers: Floats, at: slice | None = None, free: float = 0.0) -> Adjusted:
-        """Adjust from X_FS (4, 4) and numbers, with some of these free to a sigma."""
+    def solved(self, start: Unknowns, at: slice | None = None, free: float = 0.0) -> Adjusted:
+        """Adjust, with some of the numbers free to a sigma."""
         sigma = self.sigma.copy()
         if at is not None:
             sigma[at] = free
         prior = np.diag(1.0 / sigma**2)
         prior[self.sensor, self.sensor] = self.sensor_information
-        start = Unknowns((X,), numbers)
         return adjust(start, self.rows, self.kinds, prior=prior, mean=self.start, steps=_STEPS)
 
     def tested(self, best: Adjusted, part: int, name: str, at: slice, free: float) -> Cause:
         """Solve with some numbers of a part free, and return how likely they are as large by chance."""
-        found = self.solved(best.at.poses[0], best.at.numbers, at, free)
+        found = self.solved(best.at, at, free)
         x, k, C = found.at.numbers[at] - self.start[at], slice(6 + at.start, 6 + at.stop), found.covariance
         W = np.linalg.inv(C[k, k])
         square = float(x @ W @ x)
@@ -157,19 +148,24 @@ class _Problem:
         shares = [float(x @ W @ (C @ N @ C)[k, k] @ W @ x) / max(square, 1e-300) for N in found.of]  # 1e-300: no zero
         spare = [*found.spare[:-1], found.spare[-1] + ARM_NUMBERS]
         few = sum(share**2 / s for share, s in zip(shares, spare, strict=True))
-        who, scale, unit = self.parts[part].name, *((np.degrees(1.0), "deg") if name == "turn" else (1e3, "mm"))
+        who, scale, unit = self.parts[part].name, 1e3, "mm"
+        if name == "turn":
+            scale, unit = float(np.degrees(1.0)), "deg"
+        sign = "" if name == "radius" else "+"
         size = ", ".join(
-            f"{scale * v:+.3f} +- {scale * s:.3f}" for v, s in zip(x, np.sqrt(np.diag(C)[k]), strict=True)
+            f"{scale * (v if sign else abs(v)):{sign}.3f} +- {scale * s:.3f}"
+            for v, s in zip(x, np.sqrt(np.diag(C)[k]), strict=True)
         )
         if name == "radius":
-            words, advice = f"the sphere's radius is {size} mm more than stated", "measure the sphere's diameter"
+            words = f"the sphere's radius is {size} mm {'larger' if x[0] > 0.0 else 'smaller'} than stated"
+            advice = "measure the sphere's diameter"
         else:
-            how = f"a {name} of ({size}) {unit} along x, y, z of the flange"
-            other = self.parts[0].name if len(self.parts) == 2 else "other parts"
-            words = f"{who} and {other} differ by {how}"
+            pair = len(self.parts) == 2
+            who_else = f"the {self.parts[0].name}" if pair else "the other parts"
+            words = f"the {who} and {who_else} differ by a {name} of ({size}) {unit} along x, y, z of the flange"
             advice = (
-                f"check the tool (TCP) that was active for the {who}{f' and the {other}' if len(self.parts) == 2 else ''}"
-                ", and whether the profiler or its bracket was moved in between"
+                f"check which tool (TCP) was active for {'both' if pair else f'the {who}'}, and whether the profiler's"
+                " bracket moved between them"
             )
         return Cause(
             name=name,
@@ -190,7 +186,7 @@ def arm_terms(poses: FlangePoses, middle: Floats) -> Floats:
     n = len(poses)
     varies = np.column_stack([np.ones(n), poses.rotation.reshape(n, 9), poses.translation - middle])
     unit = np.diag([*[1.0 / ARM_REACH_M] * 3, 1.0, 1.0, 1.0])
-    return np.einsum("ab,nk->nabk", unit, varies).reshape(n, 6, -1)
+    return np.asarray(np.einsum("ab,nk->nabk", unit, varies).reshape(n, 6, -1))
 
 
 def _arm(left: Remainder) -> float:
@@ -216,7 +212,8 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
     for name, Y in starts[1:]:
         _refuse_far(first, X, name, Y)
     problem = _Problem(parts, sensor, arm_m)
-    best = problem.solved(X, problem.start)
+    best = problem.solved(Unknowns((X,), problem.start))
+    problem.kinds = [replace(kind, sigma=s) for kind, s in zip(problem.kinds, best.sigmas, strict=True)]
     X = best.at.poses[0]
     tested = _tested(problem, best)
     C = best.covariance[:6, :6]
@@ -278,7 +275,7 @@ def _refuse_open(C: Floats, best: Adjusted) -> None:
     J = np.concatenate([row.J[:, :, :6].reshape(-1, 6) for row in best.rows])
     if sigma > VAGUE_M or not np.diag(C).min() > 0.0 or np.linalg.matrix_rank(J) < 6:
         raise DegenerateMotion(
-            f"These scans leave the {worst_direction(np.linalg.pinv(C))} open: tilt the flange about two axes by 15 to"
+            f"These scans leave the {worst_direction(np.asarray(np.linalg.pinv(C), float))} open: tilt the flange about two axes by 15 to"
             " 30 deg, and add planes of other normals or another feature."
         )
 
@@ -294,4 +291,5 @@ def _tested(problem: _Problem, best: Adjusted) -> list[Cause]:
         if part.name == "sphere" and n > 1:
             last = problem.own[k].stop
             found.append(problem.tested(best, k, "radius", slice(last - 1, last), _FREE_RADIUS_M))
-    return sorted(found, key=lambda cause: cause.chance)
+    # another tool is mostly a shift: a turn must be clearly likelier
+    return sorted(found, key=lambda cause: cause.chance / (_LIKELY if cause.name == "turn" else 1.0))

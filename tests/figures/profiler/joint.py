@@ -20,9 +20,9 @@ from weldcal.calibration.profiler.combined.scans import FeatureScans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.tools.commands.profiler.edge import edge_shown
+from weldcal.tools.commands.profiler.edge import edge_part, edge_shown
 from weldcal.tools.commands.profiler.files import Measurements
-from weldcal.tools.commands.profiler.joint import edge_part, planes_shown, sphere_part
+from weldcal.tools.commands.profiler.joint import planes_shown, sphere_part
 from weldcal.tools.commands.profiler.result import Sigmas
 
 X_SAMPLES = np.arange(-25e-3, 25e-3, 0.1e-3)
@@ -35,7 +35,7 @@ SCANS = (24, 16, 24)  # of edge, sphere and planes
 TILT_DEG, YAW_DEG = 25.0, 50.0
 ARM_M, BREAK_M, FAULT_SIGMAS = (0.05e-3, 0.3e-3), (0.0, 1e-3), (5.0, 10.0)
 FAULTS = ("edge", "sphere", "planes", "radius")
-ORIGIN, SENSOR = np.array([0.0, DISTANCE_M]), np.diag(np.full(3, SphereSigmas().affine**2))
+ORIGIN, SENSOR = np.array([0.0, DISTANCE_M]), np.diag(np.full(3, SphereSigmas().affine ** 2))
 
 
 Views = tuple[Floats, Floats, Floats, Callable[[Floats, float], Floats]]
@@ -94,11 +94,7 @@ def made_set(seed: int) -> Made:
         believed = w.cell.arm.frames(q)[:, 6]
         scans.append(Scans(FlangePoses(believed[:, :3, :3], believed[:, :3, 3]), tuple(profiles)))
     return Made(
-        edge=scans[0],
-        sphere=scans[1],
-        planes=tuple(scans[2:]),
-        X_FS=pose(w.rotation, w.translation),
-        break_m=break_m,
+        edge=scans[0], sphere=scans[1], planes=tuple(scans[2:]), X_FS=pose(w.rotation, w.translation), break_m=break_m
     )
 
 
@@ -133,14 +129,11 @@ def _edge_views(w: SphereWorld, rng: np.random.Generator) -> Views:
     def cut(X_BS: Floats, r: float) -> Floats:
         o, d = _rays(X_BS)
         u, h, v, k = (o - centre) @ inward, (o - centre) @ up, d @ inward, d @ up
-        nearest = np.full(len(u), np.inf)
-        for s, hits in (
-            (-h / k, lambda s: u + s * v >= r),
-            (-u / v, lambda s: (h + s * k <= -r) & (h + s * k >= -FLOOR_M)),
-            ((-FLOOR_M - h) / k, lambda s: u + s * v <= 0.0),
-        ):
-            good = (s > 0.0) & hits(s)
-            nearest = np.where(good, np.minimum(nearest, s), nearest)
+        top, beside, below = -h / k, -u / v, (-FLOOR_M - h) / k  # distances to the faces and the floor
+        fall = h + beside * k
+        nearest = np.where((top > 0.0) & (u + top * v >= r), top, np.inf)
+        nearest = np.where((beside > 0.0) & (fall <= -r) & (fall >= -FLOOR_M), np.minimum(nearest, beside), nearest)
+        nearest = np.where((below > 0.0) & (u + below * v <= 0.0), np.minimum(nearest, below), nearest)
         if r > 0.0:  # the arc about (r, -r), where it is outside of both faces
             a, b, c = v**2 + k**2, (u - r) * v + (h + r) * k, (u - r) ** 2 + (h + r) ** 2 - r**2
             with np.errstate(invalid="ignore"):
@@ -195,8 +188,9 @@ def parts_of(made: Made) -> list[FeatureScans]:
     shown = edge_shown(made.edge.file, sigmas, "bar", "left", "away")
     arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in made.sphere.profiles)
     sphere = SphereData(poses=made.sphere.poses, profiles=arcs, radius_m=made.radius_m)
-    parts = [edge_part(shown, sigmas, "bar", "left", ORIGIN), sphere_part(sphere, SphereSigmas(), ORIGIN)]
-    return [*parts, planes_of(made, parts[1].X_FS)]
+    assert shown.fit is not None
+    ball = sphere_part(sphere, SphereSigmas(), ORIGIN)
+    return [edge_part(shown, *shown.fit, ORIGIN), ball, planes_of(made, ball.X_FS)]
 
 
 def planes_of(made: Made, X_FS: Floats | None = None) -> FeatureScans:
@@ -231,7 +225,8 @@ def faulty(made: Made, good: JointEstimate, part: str, rng: np.random.Generator)
 def profiler_joint(run: Run) -> None:
     """Make sets by rays with a wrong arm, and solve them as the commands do. 3 s a set."""
     squares: dict[str, list[float]] = {who: [] for who in ("edge", "sphere", "planes", "together")}
-    breaks, wrong, named, right, of = [], 0, dict.fromkeys(FAULTS, 0), dict.fromkeys(FAULTS, 0), dict.fromkeys(FAULTS, 0)
+    named, right, of = (dict.fromkeys(FAULTS, 0) for _ in range(3))
+    breaks, wrong = list[float](), 0
     seeds = run.seeds(3, 200)
     for n, seed in enumerate(seeds):
         run.progress(f"set {seed}", n / len(seeds))
@@ -253,10 +248,11 @@ def profiler_joint(run: Run) -> None:
     limit, total = chi2_quantile(0.95, 6.0), len(seeds)
     held = {who: sum(v < limit for v in each) for who, each in squares.items()}
     rows = [
-        (f"{who}: 95 % region holds the truth", f"{held[who]} of {total}", f"mean square {np.mean(each):.1f}, 6 expected")
+        (f"{who}: truth in the 95 % region", f"{held[who]} of {total}", f"mean square {np.mean(each):.1f}, 6 expected")
         for who, each in squares.items()
     ]
-    rows.append(("radius of the break, error over its sigma", f"{np.sqrt(np.mean(np.square(breaks))):.2f}", "1 expected"))
+    spread = float(np.sqrt(np.mean(np.square(breaks))))
+    rows.append(("radius of the break, error over its sigma", f"{spread:.2f}", "1 expected"))
     rows.append(("parts agree: falsely named", f"{wrong} of {total}", "1 of 100"))
     for fault in FAULTS:
         what = "sphere's radius" if fault == "radius" else f"tool of the {fault}"

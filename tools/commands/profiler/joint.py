@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import typer
@@ -13,18 +13,22 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.geometry.se3 import pose
 from weldcal.calibration.profiler.combined.planes import line_of, plane_scans, planes_fit
-from weldcal.calibration.profiler.combined.scans import EdgeScans, FeatureScans, edge_scans, sphere_scans
+from weldcal.calibration.profiler.combined.scans import FeatureScans, sphere_scans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
-from weldcal.calibration.profiler.depth_sign import WORDS
-from weldcal.calibration.profiler.edge.features import near_face
-from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import sphere_joint
-from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas, corrected
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.edge import SIGMAS_MM, EdgeShown, edge_by_noise, edge_shown
+from weldcal.tools.commands.profiler.edge import (
+    SIGMAS_MM,
+    break_figures,
+    edge_by_noise,
+    edge_part,
+    edge_shown,
+    straightened,
+)
 from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.commands.profiler.result import (
     PosesOption,
@@ -48,33 +52,7 @@ ARM_LARGE_M = 0.3e-3  # a choice: what arms that are not calibrated are wrong by
 _AFFINE = SphereSigmas().affine
 
 
-def edge_part(
-    shown: EdgeShown, sigmas: Sigmas, feature: str, side: str, origin: Floats, affine: Floats | None = None
-) -> EdgeScans:
-    """Return the scans of an edge about its own estimate, without outliers; a break where raw profiles show a corner."""
-    poses, points = shown.seen()
-    e, sigmas = shown.fit or edge_by_noise(poses, points, sigmas)
-    faces, away = None, -1.0 if shown.words.get("z_grows") == WORDS["towards"] else 1.0
-    if feature in ("bar", "step"):
-        profiles = [p for p, kept in zip(shown.file.profiles or (), shown.keep, strict=True) if kept]
-        near = cast(Literal["left", "right"], side)
-        faces = np.array(
-            [near_face(p, at, near) for p, at in zip(profiles, shown.points[shown.keep], strict=True)]
-        )[e.inliers]
-    return edge_scans(
-        poses[e.inliers],
-        points[e.inliers] if affine is None else straightened(points[e.inliers], affine, origin),
-        EdgeState(e.rotation, e.translation, e.point, e.direction),
-        sigma_xz_m=np.array([sigmas.x_m, sigmas.z_m]),
-        origin=origin,
-        faces=faces,
-        away=away,
-    )
-
-
-def sphere_part(
-    data: SphereData, sigmas: SphereSigmas, origin: Floats, affine: Floats | None = None
-) -> FeatureScans:
+def sphere_part(data: SphereData, sigmas: SphereSigmas, origin: Floats, affine: Floats | None = None) -> FeatureScans:
     """Return the scans of a sphere about its own estimate, without wrong scans."""
     if affine is not None:
         data = replace(data, profiles=[straightened(p, affine, origin) for p in data.profiles])
@@ -101,7 +79,8 @@ def planes_shown(files: Sequence[Measurements]) -> PlanesShown:
     Raises:
         InputError: no profiles, or more than three planes.
     """
-    R, t, profiles, of, lost = [], [], [], [], []
+    R, t, of = list[Floats](), list[Floats](), list[tuple[int, float]]()
+    profiles, lost = list[Floats](), list[int]()
     for n, file in enumerate(files):
         if file.profiles is None:
             raise InputError("The file has no 'profiles' of a plane. Give (n, m, 2), or 'xz' with the lengths 'n'.")
@@ -115,7 +94,9 @@ def planes_shown(files: Sequence[Measurements]) -> PlanesShown:
             except FeatureNotFound:
                 lost.append(len(lost) + len(profiles))
                 continue
-            R, t, profiles = [*R, poses.rotation[k]], [*t, poses.translation[k]], [*profiles, p]
+            R.append(poses.rotation[k])
+            t.append(poses.translation[k])
+            profiles.append(p)
             of.append((n, float(plane[k])))
     if not profiles:
         raise FeatureNotFound("No profile shows a single line: bring the plane alone into the laser line.")
@@ -143,9 +124,7 @@ def planes_decided(files: Sequence[Measurements], form: str = "") -> list[Measur
 
 
 @command(
-    "profiler planes",
-    keys=("robot-form", "pitch", "sensor-correction"),
-    short_help="Calibrate by one to three planes.",
+    "profiler planes", keys=("robot-form", "pitch", "sensor-correction"), short_help="Calibrate by one to three planes."
 )
 def planes(
     call: Call,
@@ -216,15 +195,17 @@ def _joined(
     whole = np.vstack([p[np.isfinite(p).all(axis=1)] for p in seen])
     correction = stated_correction(call, seen)
     origin = whole.mean(axis=0) if correction is None else correction.origin
-    affine, S = (np.zeros(3), _AFFINE**2 * np.eye(3)) if correction is None else (correction.values, correction.covariance)
+    affine, S = np.zeros(3), _AFFINE**2 * np.eye(3)
+    if correction is not None:
+        affine, S = correction.values, correction.covariance
     made: list[FeatureScans] = []
     if shown is not None:
-        made.append(edge_part(shown, sigmas, feature, call.reading.get("side", "left"), origin, affine))
+        made.append(edge_part(shown, *(shown.fit or edge_by_noise(*shown.seen(), sigmas)), origin, affine))
     if sphere is not None:
         made.append(sphere_part(sphere, SphereSigmas(sensor_m=z, robot_m=r), origin, affine))
     if flat is not None:
-        start = made[-1].X_FS if made else None
-        made.append(plane_scans(flat.poses, [straightened(p, affine, origin) for p in flat.profiles], flat.of, origin, start))
+        right = [straightened(p, affine, origin) for p in flat.profiles]
+        made.append(plane_scans(flat.poses, right, flat.of, origin, made[-1].X_FS if made else None))
     e = solve_joint(made, S)
     found = joint_figures(e, made) | {
         "without_feature": [] if shown is None else shown.lost,
@@ -236,13 +217,8 @@ def _joined(
     record = replace(record, affine=affine + e.sensor, origin=origin)
     name = "+".join(file.name for _, file in given)
     folder = call.folder("profiler", given[0][1].stem if len(given) == 1 else "joint")
-    file, summary = finish(record, with_warnings(data[0], found), whole, np.zeros(0), name, folder, limit_mm)
-    return outcome_of(call, summary, file)
-
-
-def straightened(p: Floats, affine: Floats, origin: Floats) -> Floats:
-    """Return a profile (n, 2) m as a sensor correction corrects it."""
-    return corrected(p, affine, origin)[:, [0, 2]]
+    result, summary = finish(record, with_warnings(data[0], found), whole, np.zeros(0), name, folder, limit_mm)
+    return outcome_of(call, summary, result)
 
 
 def joint_figures(e: JointEstimate, parts: Sequence[FeatureScans]) -> dict[str, Any]:
@@ -250,21 +226,15 @@ def joint_figures(e: JointEstimate, parts: Sequence[FeatureScans]) -> dict[str, 
     found: dict[str, Any] = {"scans": sum(len(part.poses) for part in parts), **figures_of(e)}
     found["parts"] = {part.name: len(part.poses) for part in parts}
     found["odd_scans"] = {part.name: list(odd) for part, odd in zip(parts, e.odd, strict=True)}
-    found["arm_mm"] = 1e3 * e.arm_m
+    found |= break_figures(e)
     said = []
-    if e.edge_radius_m is not None:
-        found["edge_radius_mm"], found["edge_radius_sigma_mm"] = (1e3 * v for v in e.edge_radius_m)
     if e.tested:
         found["agree"] = not e.causes
         found["causes"] = [cause.words for cause in e.causes]
     if e.causes:
         first, *other = e.causes
-        said.append(
-            f"The parts do not agree: {first.words} (by chance once in {1.0 / max(first.chance, 1e-12):.2g} times)."
-            f" {first.advice[0].upper()}{first.advice[1:]}."
-            + (f" As likely: {other[0].words}; {other[0].advice}." if other else "")
-            + " The uncertainty is enlarged until they do."
-        )
+        said.append(f"The parts disagree: {first.words}: {first.advice}.")
+        said += [f"As likely an explanation: {one.words}: {one.advice}." for one in other]
     if e.arm_m > ARM_LARGE_M:
         said.append(
             f"The arm's error changes by {1e3 * e.arm_m:.2f} mm between these poses, more than calibrated arms have:"
