@@ -20,8 +20,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.model import corrected
 
-RADIUS_M = 0.58e-3
-"""Of an edge's break: the root mean square of 0 to 1 mm, the usual breaks of ISO 13715."""
+RADIUS_M = 0.58e-3  # of an edge's break: the root mean square of 0 to 1 mm, the usual ones of ISO 13715
 EXACT = 1e-9  # m or rad: sigma of what is not free
 SPHERE_M = 5e-6  # of a stated radius: balls of ISO 3290 grade 40 and better
 _GRAZING = np.radians(75.0)  # beyond it no profiler measures the near face
@@ -30,7 +29,7 @@ _LEAST = 0.05  # of the sphere's radius: a smaller circle says nothing of how fa
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PredictedScans:
     """Predicted less measured numbers e (n, k) m, and derivatives.
 
     ``twist`` (n, k, 6) by [turn; shift] of S in its own axes, ``numbers`` (n, k, m) by the feature's numbers.
@@ -63,7 +62,7 @@ class FeatureScans(ABC):
     X_FS: Floats | None = None
 
     @abstractmethod
-    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> Placed:
+    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> PredictedScans:
         """Predict the scans with the scan plane at poses R_BS (n, 3, 3), p_BS (n, 3)."""
 
 
@@ -79,7 +78,7 @@ class EdgeScans(FeatureScans):
     break_by: Floats
     inward: Floats
 
-    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> Placed:
+    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> PredictedScans:
         """See FeatureScans: the model of edge_joint with S as its flange, and the break."""
         across = frames_along(self.start.direction)[:, :2]
         e = self.start.direction + across @ numbers[2:4]
@@ -89,7 +88,7 @@ class EdgeScans(FeatureScans):
         to_start = frames_along(e)[:, :2].T @ across
         by_break = -np.einsum("nai,i,n->na", by_robot, self.inward, self.break_by)
         by = np.concatenate([J[:, :, 6:8] @ to_start, J[:, :, 8:10] @ to_start, by_break[:, :, None]], axis=2)
-        return Placed(p + numbers[4] * by_break - self.points, J[:, :, :6], by)
+        return PredictedScans(p + numbers[4] * by_break - self.points, J[:, :, :6], by)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,7 +97,7 @@ class SphereScans(FeatureScans):
 
     circles: Floats
 
-    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> Placed:
+    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> PredictedScans:
         """See FeatureScans."""
         c = np.einsum("nji,nj->ni", R_BS, numbers[:3] - p_BS)
         radius = numbers[3]
@@ -110,7 +109,7 @@ class SphereScans(FeatureScans):
         by_radius = np.zeros((len(c), 3, 1))
         by_radius[:, 2, 0] = radius / r
         e = np.column_stack([c[:, 0], c[:, 2], r]) - self.circles
-        return Placed(e, twist, np.concatenate([K @ np.swapaxes(R_BS, 1, 2), by_radius], axis=2))
+        return PredictedScans(e, twist, np.concatenate([K @ np.swapaxes(R_BS, 1, 2), by_radius], axis=2))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,7 +124,7 @@ class PlaneScans(FeatureScans):
     normal: Floats
     middle: Floats
 
-    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> Placed:
+    def placed(self, R_BS: Floats, p_BS: Floats, numbers: Floats) -> PredictedScans:
         """See FeatureScans: e is how far the points lie beyond the plane."""
         each = numbers.reshape(-1, 3)
         across = frames_along(self.normal)[:, :, :2]
@@ -141,7 +140,7 @@ class PlaneScans(FeatureScans):
         by[np.arange(len(n)), :, self.of, :2] = at @ tilt
         by[np.arange(len(n)), :, self.of, 2] = -1.0
         e = np.einsum("nki,ni->nk", at, n) - each[self.of, 2:]
-        return Placed(e, twist, by.reshape(len(n), 2, -1))
+        return PredictedScans(e, twist, by.reshape(len(n), 2, -1))
 
 
 def edge_scans(

@@ -19,13 +19,12 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import LEVER_M, VAGUE_M, ProfilerEstimate, worst_direction
 
 REPEATED_M = 0.03e-3  # one sigma per axis of a repeatability of 0.05 mm (ISO 9283), as for the sphere alone
-ARM_M = 0.03e-3
-"""Prior sigma of a coefficient: arms whose links are wrong so that the flange is off by 0.1 to 0.3 mm have 0.02 to 0.04."""
+ARM_M = 0.03e-3  # prior sigma of a coefficient: arms that are off by 0.1 to 0.3 mm (rms) have 0.02 to 0.04
 ARM_NUMBERS = 3.0  # a choice: so many numbers the prior of the arm's variance counts as
 ARM_MOST_M = 0.3e-3  # a choice: of a coefficient, of an arm that is off by a millimetre or more
 ARM_REACH_M = 1.0  # the flange turns by its error over this: an arm's angles act at about its reach
 _FREE_M, _FREE_RAD = 0.05, 0.2  # a choice: what a wrong tool may differ by; beyond, parts are compared before
-_FREE_RADIUS_M = 1e-3
+_FREE_RADIUS_M = 1e-3  # the same of a radius
 LEVEL = 0.01  # chance that parts that agree are said to differ
 OUTLIER = 5.0  # sigmas of a scan's numbers
 _LIKELY = 0.05  # a choice: another cause is named as well where it is this likely against the first
@@ -33,7 +32,7 @@ _STEPS = 60
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cause:
+class Disagreement:
     """A cause that could make parts differ, fitted with all the rest.
 
     Attributes:
@@ -71,11 +70,11 @@ class JointEstimate(ProfilerEstimate):
     sensor: Floats
     arm_m: float
     edge_radius_m: tuple[float, float] | None
-    tested: tuple[Cause, ...] = ()
+    tested: tuple[Disagreement, ...] = ()
     odd: tuple[tuple[int, ...], ...] = ()
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[Disagreement, ...]:
         """The likeliest cause of a disagreement, and another that is hardly less likely; none where the parts agree."""
         if not any(cause.chance < LEVEL / len(self.tested) for cause in self.tested):
             return ()
@@ -138,7 +137,7 @@ class _Problem:
         prior[self.sensor, self.sensor] = self.sensor_information
         return adjust(start, self.rows, self.kinds, prior=prior, mean=self.start, steps=_STEPS)
 
-    def tested(self, best: Adjusted, part: int, name: str, at: slice, free: float) -> Cause:
+    def tested(self, best: Adjusted, part: int, name: str, at: slice, free: float) -> Disagreement:
         """Solve with some numbers of a part free, and return how likely they are as large by chance."""
         found = self.solved(best.at, at, free)
         x, k, C = found.at.numbers[at] - self.start[at], slice(6 + at.start, 6 + at.stop), found.covariance
@@ -167,7 +166,7 @@ class _Problem:
                 f"check which tool (TCP) was active for {'both' if pair else f'the {who}'}, and whether the profiler's"
                 " bracket moved between them"
             )
-        return Cause(
+        return Disagreement(
             name=name,
             part=who,
             words=words,
@@ -275,13 +274,13 @@ def _refuse_open(C: Floats, best: Adjusted) -> None:
     J = np.concatenate([row.J[:, :, :6].reshape(-1, 6) for row in best.rows])
     if sigma > VAGUE_M or not np.diag(C).min() > 0.0 or np.linalg.matrix_rank(J) < 6:
         raise DegenerateMotion(
-            f"These scans leave the {worst_direction(np.asarray(np.linalg.pinv(C), float))} open: tilt the flange about two axes by 15 to"
-            " 30 deg, and add planes of other normals or another feature."
+            f"These scans leave the {worst_direction(np.asarray(np.linalg.pinv(C), float))} open: tilt the flange about"
+            " two axes by 15 to 30 deg, and add planes of other normals or another feature."
         )
 
 
-def _tested(problem: _Problem, best: Adjusted) -> list[Cause]:
-    """Return every cause of a disagreement, the likeliest first: tools and mountings of the parts, a sphere's radius."""
+def _tested(problem: _Problem, best: Adjusted) -> list[Disagreement]:
+    """Return every cause that is tested, the likeliest first: another tool of a part, another radius of a sphere."""
     n, found = len(problem.parts), []
     for k, part in enumerate(problem.parts):
         if n > 2 or k:  # of two, either may be the one that is off: both are one test

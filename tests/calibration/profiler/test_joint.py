@@ -63,11 +63,11 @@ def test_derivatives_are_those_of_the_prediction(k: int) -> None:
     h, none, still = 1e-6, np.zeros(len(numbers)), np.zeros(6)
     for j, u in enumerate(np.eye(6)):
         np.testing.assert_allclose(
-            (e(h * u, none) - e(-h * u, none)) / (2 * h), at.twist[:, :, j], rtol=1e-4, atol=1e-6
+            (e(h * u, none) - e(-h * u, none)) / (2 * h), at.twist[:, :, j], rtol=1e-4, atol=1e-5
         )
     for j, u in enumerate(np.eye(len(numbers))):
         np.testing.assert_allclose(
-            (e(still, h * u) - e(still, -h * u)) / (2 * h), at.numbers[:, :, j], rtol=1e-4, atol=1e-6
+            (e(still, h * u) - e(still, -h * u)) / (2 * h), at.numbers[:, :, j], rtol=1e-4, atol=1e-5
         )
 
 

@@ -211,11 +211,13 @@ def edge_part(
         profiles = [p for p, kept in zip(shown.file.profiles or (), shown.keep, strict=True) if kept]
         pairs = zip(profiles, shown.points[shown.keep], strict=True)
         faces = np.array([near_face(p, at, shown.side) for p, at in pairs])[e.inliers]
+    # sigmas that nobody stated are those that the residuals show
+    scale = 1.0 if sigmas.stated else min(1.0, float(np.sqrt(e.reduced_chi2)))
     return edge_scans(
         poses[e.inliers],
         points[e.inliers] if affine is None else straightened(points[e.inliers], affine, origin),
         EdgeState(e.rotation, e.translation, e.point, e.direction),
-        sigma_xz_m=np.array([sigmas.x_m, sigmas.z_m]),
+        sigma_xz_m=scale * np.array([sigmas.x_m, sigmas.z_m]),
         origin=origin,
         faces=faces,
         away=away,

@@ -65,7 +65,7 @@ def sphere_part(data: SphereData, sigmas: SphereSigmas, origin: Floats, affine: 
 
 @dataclass(frozen=True, eq=False)
 class PlanesShown:
-    """Poses, profiles (m, 2) m and the plane (n,) of each profile that shows a line; ``lost``: numbers of the others."""
+    """Poses, profiles (m, 2) m and the plane (n,) of the profiles that show a line; ``lost``: numbers of the others."""
 
     poses: FlangePoses
     profiles: tuple[Floats, ...]
@@ -157,7 +157,9 @@ def joint(
     given = [(kind, Path(file)) for kind, _, file in (part.partition(":") for part in parts)]
     for kind, _ in given:
         if kind not in KINDS or (kind != "planes" and sum(kind == k for k, _ in given) > 1):
-            raise InputError("Give edge:FILE and sphere:FILE once each at most, and planes:FILE for each plane.")
+            raise InputError(
+                f"Give edge:FILE and sphere:FILE once each at most, and planes:FILE for each plane; '{kind}' is wrong."
+            )
     return _joined(call, given, unit, None, feature=feature, radius=radius, limit_mm=limit_mm)
 
 
