@@ -63,12 +63,14 @@ class JointEstimate(ProfilerEstimate):
     Attributes:
         sensor: (3,) scale and shear about the origin; edge_radius_m: of its break and its sigma, where there is one.
         arm_m: the arm's error at the flange per axis, without what a constant offset takes up.
+        by_arm: (6, 6) the part of the covariance that the arm's error makes.
         tested: every cause that was tested, the likeliest first.
         odd: scans of each part that are off by more than five sigmas.
     """
 
     sensor: Floats
     arm_m: float
+    by_arm: Floats
     edge_radius_m: tuple[float, float] | None
     tested: tuple[Disagreement, ...] = ()
     odd: tuple[tuple[int, ...], ...] = ()
@@ -241,6 +243,7 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
         reduced_chi2=squares / max(sum(best.spare[:-1]), 1.0),
         condition=float(1.0 / np.linalg.cond(_unit(C))),
         sensor=values[problem.sensor],
+        by_arm=(best.covariance @ best.of[-1] @ best.covariance)[:6, :6],
         arm_m=float(np.sqrt(np.mean((moves - moves.mean(axis=0))[:, 3:] ** 2))),
         edge_radius_m=broken,
         tested=tuple(tested),

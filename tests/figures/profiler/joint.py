@@ -19,11 +19,14 @@ from weldcal.calibration.profiler.combined.planes import plane_scans
 from weldcal.calibration.profiler.combined.scans import FeatureScans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.sphere.joint import sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.tools.commands.profiler.edge import edge_part, edge_shown
+from weldcal.tools.commands.profiler.edge import EdgeShown, calibrate_edge, edge_part, edge_shown
 from weldcal.tools.commands.profiler.files import Measurements
-from weldcal.tools.commands.profiler.joint import planes_shown, sphere_part
+from weldcal.tools.commands.profiler.joint import planes_shown
 from weldcal.tools.commands.profiler.result import Sigmas
+from weldcal.tools.commands.profiler.sphere import calibrate_sphere, sphere_part
 
 X_SAMPLES = np.arange(-25e-3, 25e-3, 0.1e-3)
 RADIUS_M = 20e-3
@@ -35,6 +38,7 @@ SCANS = (24, 16, 24)  # of edge, sphere and planes
 TILT_DEG, YAW_DEG = 25.0, 50.0
 ARM_M, BREAK_M, FAULT_SIGMAS = (0.05e-3, 0.3e-3), (0.0, 1e-3), (5.0, 10.0)
 FAULTS = ("edge", "sphere", "planes", "radius")
+SIGMAS = Sigmas(stated=False)
 ORIGIN, SENSOR = np.array([0.0, DISTANCE_M]), np.diag(np.full(3, SphereSigmas().affine ** 2))
 
 
@@ -182,14 +186,22 @@ def _plane_views(w: SphereWorld, rng: np.random.Generator) -> Iterator[Views]:
         yield R_BS, p_S, at, cut
 
 
+def edge_of(made: Made) -> EdgeShown:
+    """Return the edge as the command finds it in the profiles."""
+    return edge_shown(made.edge.file, SIGMAS, "bar", "left", "away")
+
+
+def sphere_of(made: Made) -> SphereData:
+    """Return the sphere's arcs."""
+    arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in made.sphere.profiles)
+    return SphereData(poses=made.sphere.poses, profiles=arcs, radius_m=made.radius_m)
+
+
 def parts_of(made: Made) -> list[FeatureScans]:
     """Return the scans of a set as the command reduces them."""
-    sigmas = Sigmas(stated=False)
-    shown = edge_shown(made.edge.file, sigmas, "bar", "left", "away")
-    arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in made.sphere.profiles)
-    sphere = SphereData(poses=made.sphere.poses, profiles=arcs, radius_m=made.radius_m)
+    shown, sphere = edge_of(made), sphere_of(made)
     assert shown.fit is not None
-    ball = sphere_part(sphere, SphereSigmas(), ORIGIN)
+    ball = sphere_part(sphere, sphere_joint(sphere, "affine"), ORIGIN)
     return [edge_part(shown, *shown.fit, ORIGIN), ball, planes_of(made, ball.X_FS)]
 
 
@@ -199,8 +211,9 @@ def planes_of(made: Made, X_FS: Floats | None = None) -> FeatureScans:
     return plane_scans(planes.poses, planes.profiles, planes.of, ORIGIN, X_FS)
 
 
-def square_of(e: JointEstimate, X_FS: Floats) -> float:
+def square_of(e: JointEstimate | ProfilerRecord, X_FS: Floats) -> float:
     """Return the squared Mahalanobis distance of the truth."""
+    assert e.covariance is not None
     d = difference(pose(e.rotation, e.translation), X_FS)
     return float(d @ np.linalg.solve(e.covariance, d))
 
@@ -232,10 +245,11 @@ def profiler_joint(run: Run) -> None:
         run.progress(f"set {seed}", n / len(seeds))
         made, rng = made_set(seed), np.random.default_rng([seed, 63])
         parts = parts_of(made)
-        alone = [parts[:1], parts[1:2], [planes_of(made)]]
-        for who, some in zip(squares, [*alone, parts], strict=True):
-            e = solve_joint(some, SENSOR)
-            squares[who].append(square_of(e, made.X_FS))
+        e = solve_joint(parts, SENSOR)
+        edge, _ = calibrate_edge(edge_of(made), SIGMAS)
+        sphere, _ = calibrate_sphere(sphere_of(made), "", Sigmas(), model="affine")
+        for who, one in zip(squares, [edge, sphere, solve_joint([planes_of(made)], SENSOR), e], strict=True):
+            squares[who].append(square_of(one, made.X_FS))
         assert e.edge_radius_m is not None
         breaks.append((e.edge_radius_m[0] - made.break_m) / e.edge_radius_m[1])
         wrong += bool(e.causes)

@@ -283,13 +283,15 @@ def calibrate_edge(
         C = with_sensor(e, sensor, poses, shown.points[keep], sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz)
         e, found["sensor_correction"] = replace(e, covariance=C), sensor.data_sha256
     found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
+    origin, S = points.mean(axis=0), EXACT**2 * np.eye(3)
+    if sensor is not None:
+        origin, S = sensor.origin, sensor.covariance
+    whole = solve_joint([edge_part(shown, e, sigmas, origin)], S)
     if shown.feature in CORNERS:
-        origin, S = points.mean(axis=0), EXACT**2 * np.eye(3)
-        if sensor is not None:
-            origin, S = sensor.origin, sensor.covariance
-        whole = solve_joint([edge_part(shown, e, sigmas, origin)], S)
         e = replace(e, rotation=whole.rotation, translation=whole.translation, covariance=whole.covariance)
-        found |= break_figures(whole)
+    else:
+        e = replace(e, covariance=e.covariance + whole.by_arm)
+    found |= break_figures(whole)
     found |= figures_of(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
         # the side of the near face changes with the direction of the laser line: as in the scans so far

@@ -11,14 +11,13 @@ import typer
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FeatureNotFound
-from weldcal.calibration.geometry.se3 import pose
 from weldcal.calibration.profiler.combined.planes import line_of, plane_scans, planes_fit
-from weldcal.calibration.profiler.combined.scans import FeatureScans, sphere_scans
+from weldcal.calibration.profiler.combined.scans import FeatureScans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import sphere_joint
-from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.profiler.edge import (
@@ -43,24 +42,13 @@ from weldcal.tools.commands.profiler.result import (
     stated_correction,
     with_warnings,
 )
-from weldcal.tools.commands.profiler.sphere import decided_sphere
+from weldcal.tools.commands.profiler.sphere import decided_sphere, sphere_part
 from weldcal.tools.report.first_screen import check_limit
 
 KINDS = ("edge", "sphere", "planes")
 MOST_PLANES = 3
 ARM_LARGE_M = 0.3e-3  # a choice: what arms that are not calibrated are wrong by
 _AFFINE = SphereSigmas().affine
-
-
-def sphere_part(data: SphereData, sigmas: SphereSigmas, origin: Floats, affine: Floats | None = None) -> FeatureScans:
-    """Return the scans of a sphere about its own estimate, without wrong scans."""
-    if affine is not None:
-        data = replace(data, profiles=[straightened(p, affine, origin) for p in data.profiles])
-    data = replace(data, touches=None, tip=None, touch_q=None, sensor=None)
-    e = sphere_joint(data, "affine", sigmas)
-    kept = data.without(*e.wrong_poses)
-    arcs = [p[np.isfinite(p).all(axis=1)] for p in kept.profiles]
-    return sphere_scans(kept.poses, arcs, data.radius_m, e.center, pose(e.rotation, e.translation), origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,10 +192,13 @@ def _joined(
     if shown is not None:
         made.append(edge_part(shown, *(shown.fit or edge_by_noise(*shown.seen(), sigmas)), origin, affine))
     if sphere is not None:
-        made.append(sphere_part(sphere, SphereSigmas(sensor_m=z, robot_m=r), origin, affine))
+        right = [straightened(p, affine, origin) for p in sphere.profiles]
+        sphere = replace(sphere, touches=None, tip=None, touch_q=None, profiles=right)
+        ball = sphere_joint(sphere, "affine", SphereSigmas(sensor_m=z, robot_m=r))
+        made.append(sphere_part(sphere, ball, origin))
     if flat is not None:
-        right = [straightened(p, affine, origin) for p in flat.profiles]
-        made.append(plane_scans(flat.poses, right, flat.of, origin, made[-1].X_FS if made else None))
+        level = [straightened(p, affine, origin) for p in flat.profiles]
+        made.append(plane_scans(flat.poses, level, flat.of, origin, made[-1].X_FS if made else None))
     e = solve_joint(made, S)
     found = joint_figures(e, made) | {
         "without_feature": [] if shown is None else shown.lost,
