@@ -15,6 +15,7 @@ MEDIAN = 5  # samples: takes out single spikes
 RUN_M = 6e-3  # of the face beside an edge that is looked at
 FLANK_M = 15e-3  # the same of a blade's flank
 MINIMUM_RUN = 8  # samples
+MINIMUM_FACE = 3  # samples that give the direction of a face
 TUKEY = 4.0  # robust sigmas beyond which a sample has no weight in a line
 GAP = 4.0  # pitches without a return that end a plateau
 
@@ -51,7 +52,7 @@ def near_face(profile: ArrayLike, point: Floats, side: Literal["left", "right"] 
     p, sign = returns_of(profile, MINIMUM_RUN, "object"), 1.0 if side == "left" else -1.0
     beyond = sign * (p[:, 0] - point[0])
     face = p[(beyond > 0.25 * RUN_M) & (beyond < RUN_M)]
-    if len(face) < MINIMUM_RUN:
+    if len(face) < MINIMUM_FACE:
         raise FeatureNotFound("The near face is too short: bring more of it into the laser line.")
     return sign * np.array([1.0, robust_line(face[:, 0], face[:, 1])[1]])
 

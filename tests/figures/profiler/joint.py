@@ -248,17 +248,18 @@ def profiler_joint(run: Run) -> None:
         e = solve_joint(parts, SENSOR)
         edge, _ = calibrate_edge(edge_of(made), SIGMAS)
         sphere, _ = calibrate_sphere(sphere_of(made), "", Sigmas(), model="affine")
-        for who, one in zip(squares, [edge, sphere, solve_joint([planes_of(made)], SENSOR), e], strict=True):
+        found: list[JointEstimate | ProfilerRecord] = [edge, sphere, solve_joint([planes_of(made)], SENSOR), e]
+        for who, one in zip(squares, found, strict=True):
             squares[who].append(square_of(one, made.X_FS))
         assert e.edge_radius_m is not None
         breaks.append((e.edge_radius_m[0] - made.break_m) / e.edge_radius_m[1])
         wrong += bool(e.causes)
         fault = FAULTS[n % len(FAULTS)]
         bad, cause = faulty(made, e, fault, rng)
-        found = solve_joint(parts_of(bad), SENSOR).causes
+        causes = solve_joint(parts_of(bad), SENSOR).causes
         of[fault] += 1
-        named[fault] += bool(found)
-        right[fault] += bool(found) and cause in [(c.name, c.part) for c in found]
+        named[fault] += bool(causes)
+        right[fault] += bool(causes) and cause in [(c.name, c.part) for c in causes]
     limit, total = chi2_quantile(0.95, 6.0), len(seeds)
     held = {who: sum(v < limit for v in each) for who, each in squares.items()}
     rows = [
