@@ -6,6 +6,7 @@ arc between them), the sphere or a plane. The arm has a wrong table of links; it
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ from weldcal.calibration.profiler.combined.scans import FeatureScans
 from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
-from weldcal.calibration.profiler.sphere.joint import sphere_joint
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.tools.commands.profiler.edge import EdgeShown, calibrate_edge, edge_part, edge_shown
 from weldcal.tools.commands.profiler.files import Measurements
@@ -186,22 +187,25 @@ def _plane_views(w: SphereWorld, rng: np.random.Generator) -> Iterator[Views]:
         yield R_BS, p_S, at, cut
 
 
-def edge_of(made: Made) -> EdgeShown:
+@lru_cache(maxsize=4)
+def edge_of(scans: Scans) -> EdgeShown:
     """Return the edge as the command finds it in the profiles."""
-    return edge_shown(made.edge.file, SIGMAS, "bar", "left", "away")
+    return edge_shown(scans.file, SIGMAS, "bar", "left", "away")
 
 
-def sphere_of(made: Made) -> SphereData:
-    """Return the sphere's arcs."""
-    arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in made.sphere.profiles)
-    return SphereData(poses=made.sphere.poses, profiles=arcs, radius_m=made.radius_m)
+@lru_cache(maxsize=4)
+def sphere_of(scans: Scans, radius_m: float) -> tuple[SphereData, SphereEstimate]:
+    """Return the sphere's arcs and the sphere's own estimate."""
+    arcs = tuple(p[np.isfinite(p).all(axis=1)] for p in scans.profiles)
+    data = SphereData(poses=scans.poses, profiles=arcs, radius_m=radius_m)
+    return data, sphere_joint(data, "affine")
 
 
 def parts_of(made: Made) -> list[FeatureScans]:
     """Return the scans of a set as the command reduces them."""
-    shown, sphere = edge_of(made), sphere_of(made)
+    shown, sphere = edge_of(made.edge), sphere_of(made.sphere, made.radius_m)
     assert shown.fit is not None
-    ball = sphere_part(sphere, sphere_joint(sphere, "affine"), ORIGIN)
+    ball = sphere_part(*sphere, ORIGIN)
     return [edge_part(shown, *shown.fit, ORIGIN), ball, planes_of(made, ball.X_FS)]
 
 
@@ -246,8 +250,8 @@ def profiler_joint(run: Run) -> None:
         made, rng = made_set(seed), np.random.default_rng([seed, 63])
         parts = parts_of(made)
         e = solve_joint(parts, SENSOR)
-        edge, _ = calibrate_edge(edge_of(made), SIGMAS)
-        sphere, _ = calibrate_sphere(sphere_of(made), "", Sigmas(), model="affine")
+        edge, _ = calibrate_edge(edge_of(made.edge), SIGMAS)
+        sphere, _ = calibrate_sphere(sphere_of(made.sphere, made.radius_m)[0], "", Sigmas(), model="affine")
         found: list[JointEstimate | ProfilerRecord] = [edge, sphere, solve_joint([planes_of(made)], SENSOR), e]
         for who, one in zip(squares, found, strict=True):
             squares[who].append(square_of(one, made.X_FS))
