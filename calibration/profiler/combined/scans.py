@@ -21,7 +21,7 @@ from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.model import corrected
 
 RADIUS_M = 0.58e-3  # of an edge's break: the root mean square of 0 to 1 mm, the usual ones of ISO 13715
-EXACT = 1e-9  # m or rad: sigma of what is not free
+EXACT = 1e-7  # m or rad: sigma of what is not free; below any effect, and the equations stay well scaled
 SPHERE_M = 5e-6  # of a stated radius: balls of ISO 3290 grade 40 and better
 _GRAZING = np.radians(75.0)  # beyond it no profiler measures the near face
 _STEP = 1e-4  # of scale and shear, for differences of circles

@@ -21,6 +21,7 @@ from weldcal.calibration.profiler.result import LEVER_M, VAGUE_M, ProfilerEstima
 REPEATED_M, BEST_M = 0.03e-3, 5e-6  # where the spread of scans starts, a repeatability of 0.05 mm, and its least
 ARM_M = 0.03e-3  # prior sigma of a coefficient: arms that are off by 0.1 to 0.3 mm (rms) have 0.02 to 0.04
 ARM_NUMBERS = 3.0  # a choice: so many numbers the prior of the arm's variance counts as
+SCANS_MOST_M = 1e-3  # a choice: scans that fit worse belong to no one mounting
 ARM_MOST_M = 0.3e-3  # a choice: of a coefficient, of an arm that is off by a millimetre or more
 ARM_REACH_M = 1.0  # the flange turns by its error over this: an arm's angles act at about its reach
 _FREE_M, _FREE_RAD = 0.05, 0.2  # a choice: what a wrong tool may differ by; beyond, parts are compared before
@@ -103,7 +104,7 @@ class _Problem:
             self.start[own], self.sigma[own], self.sigma[change] = part.numbers, part.known, EXACT
         self.sensor_information = np.linalg.inv(sensor)
         features = [
-            Kind(rank=float(part.own.shape[1]), loss=huber, spread=helmert, sigma=REPEATED_M, floor=BEST_M)
+            Kind(rank=float(part.own.shape[1]), loss=huber, spread=_scans, sigma=REPEATED_M, floor=BEST_M)
             for part in parts
         ]
         arm = Kind(rank=1.0, loss=plain, spread=_arm if arm_m is None else None, sigma=arm_m or ARM_M)
@@ -192,6 +193,11 @@ def arm_terms(poses: FlangePoses, middle: Floats) -> Floats:
     return np.asarray(np.einsum("ab,nk->nabk", unit, varies).reshape(n, 6, -1))
 
 
+def _scans(left: Remainder) -> float:
+    """By Helmert's estimator, half of the way, since it and the arm's spread otherwise take turns."""
+    return float(np.sqrt(left.sigma * min(helmert(left), SCANS_MOST_M)))
+
+
 def _arm(left: Remainder) -> float:
     """By the coefficients' squares and the prior, each as many numbers as it knows; half of the way, which settles."""
     square = left.sigma**2 * left.weighted + ARM_NUMBERS * ARM_M**2
@@ -215,7 +221,12 @@ def solve_joint(parts: Sequence[FeatureScans], sensor: Floats, arm_m: float | No
     for name, Y in starts[1:]:
         _refuse_far(first, X, name, Y)
     problem = _Problem(parts, sensor, arm_m)
-    best = problem.solved(Unknowns((X,), problem.start))
+    try:
+        best = problem.solved(Unknowns((X,), problem.start))
+    except np.linalg.LinAlgError:
+        raise InconsistentData(
+            "No mounting explains these scans together: calibrate by each part alone, and compare the results."
+        ) from None
     problem.kinds = [replace(kind, sigma=s) for kind, s in zip(problem.kinds, best.sigmas, strict=True)]
     X = best.at.poses[0]
     tested = _tested(problem, best)
