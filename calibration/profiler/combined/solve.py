@@ -18,7 +18,7 @@ from weldcal.calibration.profiler.combined.scans import EXACT, FeatureScans
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import LEVER_M, VAGUE_M, ProfilerEstimate, worst_direction
 
-REPEATED_M, BEST_M = 0.03e-3, 5e-6  # where the spread of scans starts, a repeatability of 0.05 mm, and its least
+REPEATED_M = 0.03e-3  # one sigma per axis of a repeatability of 0.05 mm (ISO 9283), as for the sphere alone
 ARM_M = 0.03e-3  # prior sigma of a coefficient: arms that are off by 0.1 to 0.3 mm (rms) have 0.02 to 0.04
 ARM_NUMBERS = 3.0  # a choice: so many numbers the prior of the arm's variance counts as
 SCANS_MOST_M = 1e-3  # a choice: scans that fit worse belong to no one mounting
@@ -103,10 +103,7 @@ class _Problem:
         for part, own, change in zip(parts, self.own, self.change, strict=True):
             self.start[own], self.sigma[own], self.sigma[change] = part.numbers, part.known, EXACT
         self.sensor_information = np.linalg.inv(sensor)
-        features = [
-            Kind(rank=float(part.own.shape[1]), loss=huber, spread=_scans, sigma=REPEATED_M, floor=BEST_M)
-            for part in parts
-        ]
+        features = [Kind(rank=float(part.own.shape[1]), loss=huber, spread=_scans, sigma=REPEATED_M) for part in parts]
         arm = Kind(rank=1.0, loss=plain, spread=_arm if arm_m is None else None, sigma=arm_m or ARM_M)
         self.kinds = [*features, arm]
 
@@ -127,7 +124,8 @@ class _Problem:
             numbered[:, :, own], numbered[:, :, change] = placed.numbers, by_pose
             numbered[:, :, self.sensor], numbered[:, :, self.arm] = part.by_sensor, by_arm
             e = placed.e + part.by_sensor @ numbers[self.sensor] + by_arm @ numbers[self.arm]
-            found.append(Observed(e, J, part.own))
+            shift = by_flange[:, :, 3:]
+            found.append(Observed(e, J, part.own + REPEATED_M**2 * shift @ np.swapaxes(shift, 1, 2)))
         coefficients = numbers[self.arm]
         J = np.zeros((len(coefficients), 1, 6 + self.size))
         J[:, 0, 6:][:, self.arm] = np.eye(len(coefficients))
