@@ -50,7 +50,8 @@ PANELS = {
 """The commands and groups in the order of the help text."""
 ORDER = (
     *(name for names in PANELS.values() for name in names),
-    *("tablet serve", "tablet calibrate", "tablet demo", "profiler edge", "profiler sphere", "profiler compensate"),
+    *("tablet serve", "tablet calibrate", "tablet demo", "profiler edge", "profiler sphere"),
+    *("profiler planes", "profiler joint", "profiler compensate"),
     *("profiler seam", "profiler bead", "profiler clock", "profiler step", "profiler live"),
 )
 """The full names of the commands in the order of the help text; the others follow by name."""

@@ -44,6 +44,9 @@ _NAMES = {
     "condition": ("condition of the scans, 1 at best", ""),
     "sigma_translation_mm": ("one sigma of the position", "mm"),
     "sigma_rotation_deg": ("one sigma of the rotation", "deg"),
+    "arm_mm": ("the arm's error between the poses, per axis", "mm"),
+    "edge_radius_mm": ("radius of the edge's break", "mm"),
+    "edge_radius_sigma_mm": ("one sigma of it", "mm"),
     "radius_of_profiles_mm": ("radius that the profiles show", "mm"),
     "mean_distance_mm": ("mean distance of the points from the edge", "mm"),
     "touch_rms_mm": ("touches off the sphere, rms", "mm"),
@@ -54,6 +57,7 @@ _NAMES = {
 WORDS = "pose of the scan plane S in the robot's flange F"
 _LOST = {
     "without_feature": "{n} of {all} profiles show no edge and were not used.",
+    "without_plane": "{n} of {all} profiles show no single line and were not used.",
     "without_sphere": "{n} of {all} profiles show no sphere and were not used.",
     "without_groove": "{n} of {all} profiles show no groove.",
     "outlier_scans": "{n} of {all} points lie off the edge and were not used.",
@@ -127,9 +131,9 @@ class ProfilerFile:
                 f" vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
             )
         seam = typed("profiler seam --calibration", self.out)
+        more = "" if "parts" in self.found else "; --plan 3 proposes poses to add"
         return Next(
-            f"Map a groove with it and touch some of its points: run '{seam}' and name the file of its scans; --plan 3"
-            " proposes poses to add.",
+            f"Map a groove with it and touch some of its points: run '{seam}' and name the file of its scans{more}.",
             uses=True,
         )
 

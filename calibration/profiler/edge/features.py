@@ -15,6 +15,7 @@ MEDIAN = 5  # samples: takes out single spikes
 RUN_M = 6e-3  # of the face beside an edge that is looked at
 FLANK_M = 15e-3  # the same of a blade's flank
 MINIMUM_RUN = 8  # samples
+MINIMUM_FACE = 3  # samples that give the direction of a face
 TUKEY = 4.0  # robust sigmas beyond which a sample has no weight in a line
 GAP = 4.0  # pitches without a return that end a plateau
 
@@ -42,6 +43,20 @@ def extract_edge(profile: ArrayLike, kind: Kind, side: Literal["left", "right"] 
     return _apex(p, pitch) if kind == "apex" else _end(p, pitch, MINIMUM_JUMP_M[kind])
 
 
+def near_face(profile: ArrayLike, point: Floats, side: Literal["left", "right"] = "left") -> Floats:
+    """Return the direction (2,) [x, z] in a profile of the near face beside an edge, away from the edge.
+
+    Raises:
+        FeatureNotFound: too few samples.
+    """
+    p, sign = returns_of(profile, MINIMUM_RUN, "object"), 1.0 if side == "left" else -1.0
+    beyond = sign * (p[:, 0] - point[0])
+    face = p[(beyond > 0.25 * RUN_M) & (beyond < RUN_M)]
+    if len(face) < MINIMUM_FACE:
+        raise FeatureNotFound("The near face is too short: bring more of it into the laser line.")
+    return sign * np.array([1.0, robust_line(face[:, 0], face[:, 1])[1]])
+
+
 def _end(p: Floats, pitch: float, jump_m: float) -> tuple[Floats, Floats]:
     """Return the first sample of the near face, less half a pitch; its height from a line through the face."""
     x, z = p[:, 0], median_filter(p[:, 1], MEDIAN, mode="nearest")
@@ -53,7 +68,7 @@ def _end(p: Floats, pitch: float, jump_m: float) -> tuple[Floats, Floats]:
         face = (x >= x[begin] + 2.0 * pitch) & (x <= x[begin] + RUN_M)
         if face.sum() < MINIMUM_RUN:
             continue
-        a, b, sigma, good = _robust_line(x[face], p[face, 1])
+        a, b, sigma, good = robust_line(x[face], p[face, 1])
         if good < 0.6 * face.sum():
             continue
         near = np.abs(p[:, 1] - (a + b * x)) < max(5.0 * sigma, 0.2 * jump_m)
@@ -85,7 +100,7 @@ def _apex(p: Floats, pitch: float) -> tuple[Floats, Floats]:
                 raise FeatureNotFound(
                     "The profile does not show both flanks of the blade: move until both are visible."
                 )
-            lines.append(_robust_line(x[flank], p[flank, 1]))
+            lines.append(robust_line(x[flank], p[flank, 1]))
         (a1, b1, s1, n1), (a2, b2, s2, n2) = lines
         if not (b1 < b2 and abs(b2 - b1) > 0.2):
             raise FeatureNotFound("The two sides of the profile's nearest point do not make a blade's apex.")
@@ -100,7 +115,7 @@ def _apex(p: Floats, pitch: float) -> tuple[Floats, Floats]:
     return result
 
 
-def _robust_line(x: Floats, z: Floats) -> tuple[float, float, float, int]:
+def robust_line(x: Floats, z: Floats) -> tuple[float, float, float, int]:
     """z = a + b x by Tukey's weights: a, b, sigma of a sample, number of samples that count."""
     pairs = np.triu_indices(len(x), 1)
     across = (x[None, :] - x[:, None])[pairs]

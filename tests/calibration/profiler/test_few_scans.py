@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.calibration.profiler.test_exports import P_FS, R_FS, RADIUS, World, quaternions, world
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import DegenerateMotion
-from weldcal.calibration.profiler.edge.features import _robust_line
+from weldcal.calibration.profiler.edge.features import robust_line
 from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.reading_choice import choose_reading, sphere_fit
@@ -94,5 +94,5 @@ def test_a_table_with_blanks_in_one_line_is_one_profile(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_flank_of_points_above_each_other_has_a_slope() -> None:
     x = np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0])
-    a, b, _, _ = _robust_line(x, 2.0 + 0.5 * x)
+    a, b, _, _ = robust_line(x, 2.0 + 0.5 * x)
     assert (a, b) == (pytest.approx(2.0), pytest.approx(0.5))

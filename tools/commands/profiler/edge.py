@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import log_rotation
+from weldcal.calibration.profiler.combined.scans import EXACT, EdgeScans, edge_scans
+from weldcal.calibration.profiler.combined.solve import JointEstimate, solve_joint
 from weldcal.calibration.profiler.depth_sign import WORDS, SignFit, beats, choose_sign, signs_to_try, with_sign
-from weldcal.calibration.profiler.edge.features import Kind, extract_edge
+from weldcal.calibration.profiler.edge.features import Kind, extract_edge, near_face
 from weldcal.calibration.profiler.edge.joint import OUTLIER, EdgeEstimate, edge_joint, with_sensor
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
@@ -47,6 +49,7 @@ from weldcal.tools.report.first_screen import check_limit
 
 FAR_FROM_EDGE_MM = 1.0
 FEATURES = ("bar", "step", "apex")
+CORNERS = FEATURES[:2]  # whose point a break moves
 STARTS = (1.0, 2.0, 4.0)  # times the usual sigmas, for noisier sensors
 MOST = 6.0
 SETTLED = 1.15  # residuals up to this many times the sigmas agree with them
@@ -100,6 +103,7 @@ class EdgeShown:
         fit: the estimate by these points with its sigmas, where the choice of the sign made one.
         words: values of the JSON object on the sign of z.
         sensor: the correction of the points, if there is one.
+        feature, side: of raw profiles; an empty feature: the points are the file's own.
     """
 
     file: Measurements
@@ -108,6 +112,8 @@ class EdgeShown:
     fit: tuple[EdgeEstimate, Sigmas] | None = None
     words: Mapping[str, str] = field(default_factory=dict)
     sensor: SensorCorrection | None = None
+    feature: str = ""
+    side: Literal["left", "right"] = "left"
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -147,8 +153,9 @@ def edge_shown(
         raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
     if file.profiles is None:
         raise InputError("The file has no profiles to detect an edge in. Omit --feature.")
+    near: Literal["left", "right"] = "right" if side == "right" else "left"
     total, other_side = len(file.profiles), "right" if side == "left" else "left"
-    blank = EdgeShown(file=file, points=np.full((total, 2), np.nan), sensor=sensor)
+    blank = EdgeShown(file=file, points=np.full((total, 2), np.nan), sensor=sensor, feature=feature, side=near)
     tried = {grows: _tried(blank, sigmas, feature, side, grows) for grows in signs}
     fits = {grows: fit for grows, (_, fit) in tried.items()}
     if total and not any(fit.shown for fit in fits.values()):
@@ -189,6 +196,43 @@ def _tried(blank: EdgeShown, sigmas: Sigmas, feature: str, side: str, grows: str
     square = (2 * kept - 10) * e.reduced_chi2 + (len(at) - kept) * OUTLIER**2
     variance = square / free * (s.x_m / sigmas.x_m) ** 2
     return replace(one, fit=(e, s)), SignFit(shown=len(at), kept=kept, variance=variance, freedom=free)
+
+
+def edge_part(
+    shown: EdgeShown, e: EdgeEstimate, sigmas: Sigmas, origin: Floats, affine: Floats | None = None
+) -> EdgeScans:
+    """Return the scans of an edge about an estimate, without outliers; a break where raw profiles show a corner.
+
+    ``origin`` (2,) m and ``affine`` (3,): of the sensor's correction, where the points are not corrected.
+    """
+    poses, points = shown.seen()
+    faces, away = None, -1.0 if shown.words.get("z_grows") == WORDS["towards"] else 1.0
+    if shown.feature in CORNERS:
+        profiles = [p for p, kept in zip(shown.file.profiles or (), shown.keep, strict=True) if kept]
+        pairs = zip(profiles, shown.points[shown.keep], strict=True)
+        faces = np.array([near_face(p, at, shown.side) for p, at in pairs])[e.inliers]
+    # sigmas that nobody stated are those that the residuals show
+    scale = 1.0 if sigmas.stated else min(1.0, float(np.sqrt(e.reduced_chi2)))
+    return edge_scans(
+        poses[e.inliers],
+        points[e.inliers] if affine is None else straightened(points[e.inliers], affine, origin),
+        EdgeState(e.rotation, e.translation, e.point, e.direction),
+        sigma_xz_m=scale * np.array([sigmas.x_m, sigmas.z_m]),
+        origin=origin,
+        faces=faces,
+        away=away,
+    )
+
+
+def break_figures(e: JointEstimate) -> dict[str, float]:
+    """Return the radius of an edge's break and its sigma, mm, and the arm's error, for the JSON object."""
+    radius = zip(("edge_radius_mm", "edge_radius_sigma_mm"), e.edge_radius_m or (), strict=False)
+    return {"arm_mm": 1e3 * e.arm_m} | {key: 1e3 * value for key, value in radius}
+
+
+def straightened(p: Floats, affine: Floats, origin: Floats) -> Floats:
+    """Return a profile (n, 2) m as a sensor correction corrects it."""
+    return corrected(p, affine, origin)[:, [0, 2]]
 
 
 def point_of_edge(feature: str, side: str, profile: Floats) -> Floats:
@@ -239,6 +283,15 @@ def calibrate_edge(
         C = with_sensor(e, sensor, poses, shown.points[keep], sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz)
         e, found["sensor_correction"] = replace(e, covariance=C), sensor.data_sha256
     found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
+    origin, S = points.mean(axis=0), EXACT**2 * np.eye(3)
+    if sensor is not None:
+        origin, S = sensor.origin, sensor.covariance
+    whole = solve_joint([edge_part(shown, e, sigmas, origin)], S)
+    if shown.feature in CORNERS:
+        e = replace(e, rotation=whole.rotation, translation=whole.translation, covariance=whole.covariance)
+    else:
+        e = replace(e, covariance=e.covariance + whole.by_arm)
+    found |= break_figures(whole)
     found |= figures_of(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
         # the side of the near face changes with the direction of the laser line: as in the scans so far

@@ -38,8 +38,8 @@ ALIASES = {
     "tip_nominal": "tip",
 }
 DIMENSIONS = {
-    "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1, "q": 2,
-    "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
+    "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1,
+    "plane": 1, "q": 2, "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
 }  # fmt: skip
 LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 

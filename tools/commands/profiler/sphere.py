@@ -7,7 +7,10 @@ from typing import Annotated, Any, cast
 import numpy as np
 
 from weldcal.calibration.errors import ArcNotFound, InconsistentData
+from weldcal.calibration.geometry.se3 import pose
 from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.combined.scans import FeatureScans, sphere_scans
+from weldcal.calibration.profiler.combined.solve import solve_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import Field, plan_sphere_poses, sample_sphere_poses
 from weldcal.calibration.profiler.reading_choice import sphere_fit
@@ -250,6 +253,10 @@ def calibrate_sphere(
     if data.sensor is not None:
         _refuse_other_sensor(data, data.sensor, s, e)
         found["sensor_correction"] = data.sensor.data_sha256
+    if chosen != "affine+joints":  # which has the arm's errors as its unknowns
+        S = s.affine**2 * np.eye(3) if data.sensor is None else data.sensor.covariance
+        whole = solve_joint([sphere_part(data, e, e.origin)], S)
+        e, found["arm_mm"] = replace(e, covariance=e.covariance + whole.by_arm), 1e3 * whole.arm_m
     found |= {"model": chosen} | figures_of(e)
     found["wrong_scans"] = list(e.wrong_poses)
     # to first order, and so only where it is near the stated one
@@ -272,6 +279,13 @@ def calibrate_sphere(
         found["next_poses"] = next_poses(candidates, best.chosen, best.rms_m)
     arm = data.arm if chosen == "affine+joints" else None
     return ProfilerRecord.of(f"sphere, {chosen}", e, found, digest, arm), found
+
+
+def sphere_part(data: SphereData, e: SphereEstimate, origin: Floats) -> FeatureScans:
+    """Return the scans of a sphere about an estimate, without wrong scans; ``origin`` (2,) m: of scale and shear."""
+    kept = data.without(*e.wrong_poses)
+    arcs = [p[np.isfinite(p).all(axis=1)] for p in kept.profiles]
+    return sphere_scans(kept.poses, arcs, data.radius_m, e.center, pose(e.rotation, e.translation), origin)
 
 
 def _refuse_other_sensor(data: SphereData, sensor: SensorCorrection, s: SphereSigmas, e: SphereEstimate) -> None:

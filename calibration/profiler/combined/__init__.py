@@ -1,0 +1,1 @@
+"""Calibrates a laser profiler by planes, and by edge, sphere and planes of one mounting together."""
