@@ -125,7 +125,7 @@ def helmert(left: Remainder) -> float:
 
 
 def likeliest(left: Remainder) -> float:
-    """Weighted squares over all numbers: the maximum of the likelihood that the loss stands for."""
+    """Weighted squares over all numbers: the maximum of the loss's likelihood."""
     return left.sigma * float(np.sqrt(left.weighted / left.numbers))
 
 

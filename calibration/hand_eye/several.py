@@ -38,8 +38,8 @@ SharedError = tuple[float, float]
 class SensorPairs:
     """One sensor: its pairs, and its own solution of them with X and Y free.
 
-    ``bundle``, ``free``: of pictures, the adjustment that ``pairs`` have their camera and board from, and the numbers of
-    the camera that it estimated.
+    ``bundle``, ``free``: of pictures, the adjustment that gave ``pairs`` their camera and board, and the numbers of the
+    camera that it estimated.
     """
 
     name: str
@@ -129,7 +129,8 @@ def solve_together(sensors: Sequence[SensorPairs], config: HandEyeConfig | None 
     corner takes the place of the rotations. The standard deviations follow from the restricted
     likelihood. Camera to camera is thus as good as the sensors are, however bad the robot. Cameras with corners have an
     unknown shift of the principal point, with the standard deviation USUAL_DISCORD_RAD. The covariance contains the
-    discord of the own solution of sensors without, and the errors of camera and board of pictures. Observations that a sensor's own solution excluded are not used.
+    discord of the own solution of sensors without, and the errors of camera and board of pictures. Observations
+    that a sensor's own solution excluded are not used.
 
     Raises:
         InconsistentPoses: one of the sensors saw another target.

@@ -202,7 +202,7 @@ def clear_pieces(
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
-    """Check that nothing of the part stands in the way of tip and torch beyond the seam's ends.
+    """Check that nothing of the part blocks tip and torch beyond the seam's ends.
 
     The tip needs the space beyond its end, the torch that before its start.
 

@@ -192,12 +192,12 @@ def arm_terms(poses: FlangePoses, middle: Floats) -> Floats:
 
 
 def _scans(left: Remainder) -> float:
-    """By Helmert's estimator, half of the way, since it and the arm's spread otherwise take turns."""
+    """Halfway to Helmert's estimate: in whole steps this spread and the arm's take turns."""
     return float(np.sqrt(left.sigma * min(helmert(left), SCANS_MOST_M)))
 
 
 def _arm(left: Remainder) -> float:
-    """By the coefficients' squares and the prior, each as many numbers as it knows; half of the way, which settles."""
+    """Halfway to the estimate by the coefficients' squares and the prior, each by the numbers that it knows."""
     square = left.sigma**2 * left.weighted + ARM_NUMBERS * ARM_M**2
     found = min(float(np.sqrt(square / (left.spare + ARM_NUMBERS))), ARM_MOST_M)
     return float(np.sqrt(left.sigma * found))

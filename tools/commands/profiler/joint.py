@@ -215,7 +215,7 @@ def _joined(
 
 
 def joint_figures(e: JointEstimate, parts: Sequence[FeatureScans]) -> dict[str, Any]:
-    """What a joint solution found, for the JSON object, with what its test of agreement says to do."""
+    """Result of a joint solution for the JSON object, with the advice of its test of agreement."""
     found: dict[str, Any] = {"scans": sum(len(part.poses) for part in parts), **figures_of(e)}
     found["parts"] = {part.name: len(part.poses) for part in parts}
     found["odd_scans"] = {part.name: list(odd) for part, odd in zip(parts, e.odd, strict=True)}
