@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -198,6 +199,8 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
     """
     if len({file.resolve() for file in files}) < len(files):
         raise InputError("A file is given twice: give the file of each sensor once.")
+    if asked.robot is not None or asked.refine is not None:
+        raise InputError("--robot and --refine go with one file: calibrate each sensor by itself first.")
     names = sensor_names(files)
     each = []
     for file, name in zip(files, names, strict=True):
@@ -205,10 +208,15 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
             each.append(calibrate_recorded(file, asked, say))
         except WeldcalError as problem:
             text = f"{name}: {problem}"
-            raise InputError(f"{text} Each of several files holds the pairs of one sensor.") from problem
-    mountings = sorted({found.mounting.name for found in each})
-    if len(mountings) > 1:
-        raise InputError(f"The files are of the mountings {' and '.join(mountings)}: solve each by itself.")
+            raise InputError(
+                f"{text} Each of several files holds the pairs of one sensor; put two files of one sensor into a folder."
+            ) from problem
+    if len({found.mounting.name for found in each}) > 1:
+        listed = ", ".join(f"'{name}' is {found.mounting.name}" for name, found in zip(names, each, strict=True))
+        raise InputError(f"The files are of several mountings ({listed}): solve each mounting by itself.")
+    cameras = [found.pairs.camera for found in each if found.pairs is not None]
+    if any(np.array_equal(a, b) for a, b in combinations(cameras, 2)):
+        raise InputError("Two files hold the same poses of the camera: give the file of each sensor once.")
     if open_ := [name for name, found in zip(names, each, strict=True) if found.result.unobservable]:
         raise InputError(f"The poses of '{open_[0]}' leave a direction open: add poses, or omit this file.")
     plain = asked.corners is False

@@ -206,7 +206,7 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         symbol = SYMBOLS[mounting]
         found = poses.get(symbol)
         data = tree.get("data")
-        sha = [data.get("sha256")] if isinstance(data, Mapping) else []
+        sha = [data.get("sha256"), *(data.get("together_sha256") or [])] if isinstance(data, Mapping) else []
     else:
         symbol = next((key for key in ("X_BC", "X_FC", "X_FS", "X") if key in tree), "")
         found = tree.get(symbol)
@@ -214,6 +214,7 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         # two datasets may have one header and one list of poses
         named = hashes if isinstance(hashes, Mapping) else {"": hashes}
         sha = [value for name_of, value in named.items() if name_of not in ("dataset.yaml", "poses.csv")]
+        sha = [one for value in sha if value for one in str(value).split("+")]
         mounting = mounting or {symbol: name for name, symbol in SYMBOLS.items()}.get(symbol)
     covariance = tree.get("covariance", tree.get("covariance_X", tree.get("covariance_rotation_translation")))
     if isinstance(found, Mapping):
@@ -233,6 +234,10 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         joint = _array(_matrix(tree.get("joint_covariance")), (6 + TERMS[correction.order],) * 2)
     seen = observed.get("camera") if isinstance(observed, Mapping) else None
     points = _array(seen, (len(seen), 3)) if isinstance(seen, list) and seen else None
+    sensor = tree.get("sensor")
+    middle = _array(sensor.get("origin"), (2,)) if symbol == "X_FS" and isinstance(sensor, Mapping) else None
+    if middle is not None and middle.any():
+        points = np.array([[middle[0], 0.0, middle[1]]])
     return [listing], _Own(
         mounting=mounting,
         covariance=_array(_matrix(covariance), (6, 6)),

@@ -1,6 +1,7 @@
 """Exports a hand-eye result to YAML, JSON, URDF, ROS 2, URScript and Drake directives."""
 
 import json
+import re
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import combinations
@@ -22,10 +23,11 @@ RESULT_FILE = "hand_eye.yaml"
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result came from: the file's name and its SHA-256."""
+    """Where a result came from: the file's name and its SHA-256, and those of files that were solved with it."""
 
     source: str
     sha256: str
+    together: tuple[str, ...] = ()
 
 
 def digest(path: Path) -> str:
@@ -89,7 +91,8 @@ def document(result: HandEyeResult, mounting: Mounting, provenance: Provenance) 
                 strict=True,
             )
         ],
-        "data": {"file": provenance.source, "sha256": provenance.sha256},
+        "data": {"file": provenance.source, "sha256": provenance.sha256}
+        | ({"together_sha256": list(provenance.together)} if provenance.together else {}),
     }
 
 
@@ -116,7 +119,8 @@ def export_together(found: SensorsTogether, folder: Path) -> None:
     for i, j in combinations(range(len(found.names)), 2):
         a, b, (X, S) = found.names[i], found.names[j], found.between(i, j)
         rows.append({"parent": a, "child": b, "matrix": X.tolist(), "covariance": S.tolist()})
-        write_atomic(folder / f"{a}_to_{b}.static_transform.sh", export_ros2(as_transform(X), a, b))
+        text = export_ros2(as_transform(X), optical_frame(a), optical_frame(b))
+        write_atomic(folder / f"{a}_to_{b}.static_transform.sh", text)
     whole = {
         "schema": 1,
         "software": software_version(),
@@ -126,10 +130,18 @@ def export_together(found: SensorsTogether, folder: Path) -> None:
         "between": rows,
         "covariance_order": "rotation (rad) then translation (m), on the parent's side about the child's origin",
         "robot_noise": {"deg": float(np.degrees(found.common[0])), "mm": 1e3 * found.common[1]},
-        "sensor_noise": [{"deg": float(np.degrees(w)), "mm": float(1e3 * d)} for w, d in found.noise],
+        "sensor_noise": {
+            name: {"deg": float(np.degrees(w)), "mm": float(1e3 * d)}
+            for name, (w, d) in zip(found.names, found.noise, strict=True)
+        },
         "left_out_mm": {"apart": _number(1e3 * found.apart_m), "together": _number(1e3 * found.together_m)},
     }
     write_atomic(folder / "together.yaml", _yaml(whole))
+
+
+def optical_frame(name: str) -> str:
+    """The tf name of one of several sensors."""
+    return re.sub(r"\W+", "_", name) + "_optical_frame"
 
 
 def _yaml(whole: dict[str, object]) -> str:

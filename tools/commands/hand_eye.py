@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye, export_together
+from weldcal.calibration.hand_eye.exports import Provenance, digest, export_hand_eye, export_together, optical_frame
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures.boards import FORMS
 from weldcal.calibration.recorded_hand_eye import (
@@ -178,9 +178,12 @@ def _solve_several(call: Call, files: list[Path], asked: HandEyeOptions, limit_m
     asked = replace(asked, seed=call.seed, **{k: call.reading[k] for k in ("intrinsics",) if k in call.reading})
     folder = call.folder("hand-eye", "together")
     found = calibrate_several(files, asked, said.append)
-    for file, name, one in zip(files, found.together.names, found.each, strict=True):
-        provenance = Provenance(file.name, digest(file))
-        wrote = export_hand_eye(one.result, one.mounting, folder / name, provenance)
+    hashes = [digest(file) for file in files]
+    for file, name, one, sha in zip(files, found.together.names, found.each, hashes, strict=True):
+        provenance = Provenance(file.name, sha, tuple(other for other in hashes if other != sha))
+        sensor = replace(one.mounting.unknowns["X"], child=optical_frame(name))
+        mounting = replace(one.mounting, unknowns=one.mounting.unknowns | {"X": sensor})
+        wrote = export_hand_eye(one.result, mounting, folder / name, provenance)
         report = HandEyeReport(**vars(one), files=wrote, seconds=0.0, limit_mm=limit_mm, folder=folder / name)
         write_atomic(folder / name / "report.html", hand_eye_report(report, file.name, provenance.sha256))
     export_together(found.together, folder)

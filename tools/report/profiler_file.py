@@ -54,6 +54,7 @@ _NAMES = {
     "centre_after_mm": ("centres apart after the compensation", "mm"),
 }
 
+DISAGREE = "The parts disagree"
 WORDS = "pose of the scan plane S in the robot's flange F"
 _LOST = {
     "without_feature": "{n} of {all} profiles show no edge and were not used.",
@@ -115,9 +116,10 @@ class ProfilerFile:
         expected, larger = expected_error(what, own, p95, len(held), "scans")
         tolerance = limit_tolerance(what, larger, self.limit_mm)
         grave, notes = scan_notes(self.found)
-        found = Findings(
-            tolerance=tolerance, unseen=len(held), concerns=(*self.found.get("warnings", ()), *grave), notes=notes
-        )
+        warnings = self.found.get("warnings", ())
+        against = [text for text in warnings if self.found.get("agree") is False and text.startswith(DISAGREE)]
+        concerns = [*(text for text in warnings if text not in against), *grave]
+        found = Findings(against=against, tolerance=tolerance, unseen=len(held), concerns=concerns, notes=notes)
         pose = ShownPose("X_FS", WORDS, pose_of(self.record))
         return FirstScreen(found, expected, self._next(), (pose,))
 

@@ -164,7 +164,10 @@ class _Problem:
         else:
             pair = len(self.parts) == 2
             who_else = f"the {self.parts[0].name}" if pair else "the other parts"
-            words = f"the {who} and {who_else} differ by a {name} of ({size}) {unit} along x, y, z of the flange"
+            about = " about the profiler's origin" if name == "turn" else ""
+            words = (
+                f"the {who} differs from {who_else} by a {name}{about} of ({size}) {unit} along x, y, z of the flange"
+            )
             advice = (
                 f"check which tool (TCP) was active for {'both' if pair else f'the {who}'}, and whether the profiler's"
                 " bracket moved between them"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from tests.figures.hand_eye.several import drawn, errors, made, public_cell, solved
 from tests.places import SHARED_DATA, require_data
+from weldcal.calibration.data.stated_pose import read_stated_pose
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.geometry.se3 import difference, inverse, moved
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
@@ -110,6 +112,10 @@ def written(folder: Path, pairs: list[PosePairs], *, mode: str = "eye_on_base") 
     return [str(folder / p.source) for p in pairs]
 
 
+def compared_data(folder: Path) -> frozenset[str]:
+    return read_stated_pose(folder).data
+
+
 def run(*words: object) -> tuple[int, str, str]:
     done = CliRunner().invoke(build_app(), [str(word) for word in ("hand-eye", "ax-yb", *words)])
     return done.exit_code, done.stdout, done.stderr
@@ -128,6 +134,14 @@ def test_the_command_writes_a_result_for_each_sensor_and_the_poses_between(tmp_p
     own = yaml.safe_load((tmp_path / "out" / "camera2" / "hand_eye.yaml").read_text())
     np.testing.assert_allclose(own["poses"]["X_BC"]["matrix"], summary["sensors"][1]["X"], atol=1e-9)
     assert own["method"] == "together with camera1"
+    assert (
+        "--child-frame-id camera2_optical_frame"
+        in (tmp_path / "out" / "camera2" / "X_BC.static_transform.sh").read_text()
+    )
+    # the file of the other sensor is part of the data of both
+    first, second = (compared_data(tmp_path / "out" / name) for name in ("camera1", "camera2"))
+    assert first == second
+    assert len(first) == 2
     assert "From camera1 to camera2" in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -137,9 +151,11 @@ def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
     ridden = written(tmp_path / "ridden", rig(3, turn=1e-3, shift=1e-3)[0][:1], mode="eye_in_hand")
     (tmp_path / "robot.csv").write_text("x,y,z,qx,qy,qz,qw\n" + "0.1,0.2,0.3,0,0,0,1\n" * 5)
     for words, sentence in (
-        ((files[0], ridden[0]), "The files are of the mountings eye_in_hand and eye_on_base: solve each by itself."),
+        ((files[0], ridden[0]), "('camera1' is eye_on_base, 'c0' is eye_in_hand): solve each mounting by itself."),
         ((files[0], files[0]), "given twice"),
-        ((files[0], tmp_path / "robot.csv"), "Each of several files holds the pairs of one sensor."),
+        ((files[0], shutil.copytree(files[0], tmp_path / "copy")), "Two files hold the same poses"),
+        ((*files, "--robot", "ur10e"), "--robot and --refine go with one file"),
+        ((files[0], tmp_path / "robot.csv"), "Each of several files holds the pairs of one sensor;"),
     ):
         code, _, stderr = run(*words, "--out", tmp_path / "out")
         assert code == 1

@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.figures.profiler.joint import SENSOR, Made, Scans, made_set, parts_of, planes_of, square_of
+from weldcal.calibration.data.stated_pose import read_stated_pose
 from weldcal.calibration.errors import DegenerateMotion, FeatureNotFound
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import moved, pose
@@ -137,6 +138,29 @@ def test_the_commands_write_one_result_of_all_files(tmp_path: Path) -> None:
     code, _, text = called("joint", f"edge:{edge}", f"sphere:{bad}", "--feature", "bar", "--out", tmp_path / "bad")
     assert code == 1
     assert "the tool (TCP) that was active, or the mounting, was another" in text
+    bad = save(tmp_path / "off.npz", made.sphere.with_tool(np.array([2e-3, 0.0, 0.0])), radius=0.02)
+    code, answer, text = called(
+        "joint",
+        *(given[0], f"sphere:{bad}", *given[2:]),
+        "--feature",
+        "bar",
+        "--as",
+        "z=away",
+        "--out",
+        tmp_path / "off",
+    )
+    assert (code, answer["agree"]) == (1, False)
+    assert "The verdict is: do not use. The parts disagree: the sphere differs from the other parts by a shift" in text
+    assert read_stated_pose(tmp_path / "out").data > read_stated_pose(tmp_path / "planes").data
+    for words, sentence in (
+        (("plane:table.npz",), "'plane:table.npz' is no part: write edge:FILE, sphere:FILE or planes:FILE."),
+        (("edge:",), "'edge:' is no part"),
+        ((given[0], given[0]), "edge:FILE is given twice"),
+        ((given[2], given[2]), "Two of the files are the same"),
+    ):
+        code, _, text = called("joint", *words, "--out", tmp_path / "no")
+        assert code == 1
+        assert sentence in text
 
 
 def test_a_break_moves_the_edge_alone_less_than_its_sigma_states(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """weldcal profiler planes and joint: the pose on the flange from planes, or from edge, sphere and planes together."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,6 +43,7 @@ from weldcal.tools.commands.profiler.result import (
 )
 from weldcal.tools.commands.profiler.sphere import decided_sphere, sphere_part
 from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.profiler_file import DISAGREE
 
 KINDS = ("edge", "sphere", "planes")
 MOST_PLANES = 3
@@ -143,11 +143,11 @@ def joint(
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by several features of one mounting, and test whether they agree."""
     given = [(kind, Path(file)) for kind, _, file in (part.partition(":") for part in parts)]
-    for kind, _ in given:
-        if kind not in KINDS or (kind != "planes" and sum(kind == k for k, _ in given) > 1):
-            raise InputError(
-                f"Give edge:FILE and sphere:FILE once each at most, and planes:FILE for each plane; '{kind}' is wrong."
-            )
+    for part, (kind, file) in zip(parts, given, strict=True):
+        if kind not in KINDS or file == Path():
+            raise InputError(f"'{part}' is no part: write edge:FILE, sphere:FILE or planes:FILE.")
+        if kind != "planes" and sum(kind == k for k, _ in given) > 1:
+            raise InputError(f"{kind}:FILE is given twice: give it once, or calibrate by each and compare the results.")
     return _joined(call, given, unit, None, feature=feature, radius=radius, limit_mm=limit_mm)
 
 
@@ -205,8 +205,11 @@ def _joined(
         "without_sphere": lost,
         "without_plane": [] if flat is None else flat.lost,
     }
-    digest = data[0].digest if len(data) == 1 else hashlib.sha256("".join(d.digest for d in data).encode()).hexdigest()
-    record = ProfilerRecord.of("+".join(part.name for part in made) + ", joint", e, found, digest)
+    found["scans"] += sum(len(found[key]) for key in ("without_feature", "without_sphere", "without_plane"))
+    digests = [one.digest for one in data]
+    if len(set(digests)) < len(digests):
+        raise InputError("Two of the files are the same: give each file once.")
+    record = ProfilerRecord.of("+".join(part.name for part in made) + ", joint", e, found, "+".join(digests))
     record = replace(record, affine=affine + e.sensor, origin=origin)
     name = "+".join(file.name for _, file in given)
     folder = call.folder("profiler", given[0][1].stem if len(given) == 1 else "joint")
@@ -226,7 +229,7 @@ def joint_figures(e: JointEstimate, parts: Sequence[FeatureScans]) -> dict[str, 
         found["causes"] = [cause.words for cause in e.causes]
     if e.causes:
         first, *other = e.causes
-        said.append(f"The parts disagree: {first.words}: {first.advice}.")
+        said.append(f"{DISAGREE}: {first.words}: {first.advice}.")
         said += [f"As likely an explanation: {one.words}: {one.advice}." for one in other]
     if e.arm_m > ARM_LARGE_M:
         said.append(

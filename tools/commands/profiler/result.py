@@ -36,7 +36,7 @@ PosesOption = Annotated[
     Path | None, option("--poses", "FILE", "The flange's pose of each profile, where the export has none.")
 ]
 PlanOption = Annotated[int, option("--plan", "N", "Also propose N poses to add next.", min=0)]
-RadiusOption = Annotated[float | None, option("--radius", "MM", "Radius of the sphere, if the file has none.")]
+RadiusOption = Annotated[float | None, option("--radius", "MM", "Radius of the sphere, in place of the file's.")]
 TouchesOption = Annotated[Path | None, option("--touches", "FILE", "CSV of flange poses at touches of the sphere.")]
 TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flange frame, mm.")]
 
