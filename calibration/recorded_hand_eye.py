@@ -209,7 +209,8 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
         except WeldcalError as problem:
             text = f"{name}: {problem}"
             raise InputError(
-                f"{text} Each of several files holds the pairs of one sensor; put two files of one sensor into a folder."
+                f"{text} Each of several files holds the pairs of one sensor; put two files of one sensor into one"
+                " folder."
             ) from problem
     if len({found.mounting.name for found in each}) > 1:
         listed = ", ".join(f"'{name}' is {found.mounting.name}" for name, found in zip(names, each, strict=True))
