@@ -207,10 +207,9 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
         try:
             each.append(calibrate_recorded(file, asked, say))
         except WeldcalError as problem:
-            text = f"{name}: {problem}"
             raise InputError(
-                f"{text} Each of several files holds the pairs of one sensor; put two files of one sensor into one"
-                " folder."
+                f"{name}: {problem} Each of several files holds the pairs of one sensor; put two files of one sensor into"
+                " one folder."
             ) from problem
     if len({found.mounting.name for found in each}) > 1:
         listed = ", ".join(f"'{name}' is {found.mounting.name}" for name, found in zip(names, each, strict=True))
