@@ -208,8 +208,8 @@ def calibrate_several(files: Sequence[Path], asked: HandEyeOptions, say: Say = l
             each.append(calibrate_recorded(file, asked, say))
         except WeldcalError as problem:
             raise InputError(
-                f"{name}: {problem} Each of several files holds the pairs of one sensor; put two files of one sensor into"
-                " one folder."
+                f"{name}: {problem} Each of several files holds the pairs of one sensor; put two files of one"
+                " sensor into one folder."
             ) from problem
     if len({found.mounting.name for found in each}) > 1:
         listed = ", ".join(f"'{name}' is {found.mounting.name}" for name, found in zip(names, each, strict=True))
