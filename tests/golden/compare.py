@@ -22,8 +22,6 @@ TOLERANCES = (
     # A key (regular expression over "call.key"), and what two processors may differ by, absolute.
     # The corners of a picture come from OpenCV's vector code, which rounds by the processor; seen: 0.06 microdegrees.
     (re.compile(r"^hand_eye_pictures\."), 1e-6),
-    # The size of the local field lies in a flat likelihood; seen, one commit on two kernels: 0.9 nm, here in mm.
-    (re.compile(r"^calibrate_local\."), 2e-6),
     (re.compile(r"^(demo|weld|live)\w*\..*(_mm|mm)(\.|$)"), 0.01),
     (re.compile(r"^(demo|weld|live)\w*\."), 0.01),
 )

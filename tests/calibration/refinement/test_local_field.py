@@ -124,6 +124,16 @@ def test_the_length_is_that_of_the_residuals() -> None:
         assert found.length_m == pytest.approx(length, rel=0.5)
 
 
+def test_rounding_does_not_change_the_field() -> None:
+    """Residuals that differ in the last digits, as those of two processors do."""
+    scans = _scans(20, 3)
+    X_BR, r = [o.X_BR for o in scans], _wave(np.array([o.X_BR.translation() for o in scans]))
+    rng = np.random.default_rng(0)
+    found = [fit_field(X_BR, r * (1.0 + 1e-14 * rng.standard_normal(r.shape))) for _ in range(4)]
+    sizes = np.array([[f.length_m, f.sigma_field_m, f.sigma_scan_m] for f in found])
+    np.testing.assert_allclose(sizes[1:] / sizes[0], 1.0, atol=1e-6)
+
+
 def test_the_bootstrap_interval_holds_the_median_of_as_many_new_errors() -> None:
     rng = np.random.default_rng(0)
     inside = []
