@@ -157,10 +157,28 @@ def test_the_commands_write_one_result_of_all_files(tmp_path: Path) -> None:
         (("edge:",), "'edge:' is no part"),
         ((given[0], given[0]), "edge:FILE is given twice"),
         ((given[2], given[2]), "Two of the files are the same"),
+        ((given[0], f"sphere:{tmp_path / 'none.npz'}"), "sphere:none.npz: "),
     ):
         code, _, text = called("joint", *words, "--out", tmp_path / "no")
         assert code == 1
         assert sentence in text
+
+
+def test_a_refusal_of_trials_names_a_key_that_the_command_takes(tmp_path: Path) -> None:
+    made = world()
+    poses = [pose(p.poses.rotation, p.poses.translation) for p in made.planes]
+    T = np.concatenate(poses)
+    profiles = [q for p in made.planes for q in p.profiles]
+    length = min(len(q) for q in profiles)
+    short = np.array([q[:length] for q in profiles])
+    plane = np.repeat(np.arange(len(poses)), [len(X) for X in poses])
+    np.savez(tmp_path / "two.npz", unit="m", T=np.array([T, T]), profiles=np.array([short, short]), plane=plane)
+    code, _, text = called("planes", tmp_path / "two.npz", "--out", tmp_path / "out")
+    assert code == 1
+    assert "Choose one with --as trial=0 to 1." in text
+    code, answer, _ = called("planes", tmp_path / "two.npz", "--as", "trial=1", "--out", tmp_path / "out")
+    assert code == 0
+    np.testing.assert_allclose(np.array(answer["X_FS"])[:3, 3], made.X_FS[:3, 3], atol=2e-3)
 
 
 def test_a_break_moves_the_edge_alone_less_than_its_sigma_states(tmp_path: Path) -> None:

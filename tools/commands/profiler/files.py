@@ -144,6 +144,7 @@ def read_profiler_file(
     trial: int | None = None,
     stated: PosesStated | None = None,
     posed: bool = True,
+    alone: bool = True,
 ) -> Measurements:
     """Read an NPZ, a CSV, an export of a profiler or a folder with one file per profile.
 
@@ -152,6 +153,7 @@ def read_profiler_file(
         dataset: of an NPZ with several sets, the one whose names begin so; trial: which of its trials or worlds.
         stated: what the user states of an export's poses.
         posed: whether the flange's poses are read; they must be there.
+        alone: False: the set is of another file that is read with it, where this one has none.
 
     Raises:
         InputError: missing or unreadable file, missing or implausible unit, no such set or trial.
@@ -162,14 +164,14 @@ def read_profiler_file(
     if path.suffix.lower() == ".npz" and not path.is_dir():
         if stated != PosesStated():
             raise InputError("An NPZ holds its poses as T. Omit --poses and the keys robot-form and pitch of --as.")
-        arrays, profiles = _from_npz(path, unit, dataset, trial)
+        arrays, profiles = _from_npz(path, unit, dataset, trial, alone)
         file = Measurements(arrays=arrays, profiles=profiles, digest=sha256(path))
     elif posed:
         own = stated == PosesStated() and _is_own_table(path)
         file = _imported(path, unit, replace(stated, form=_OWN_FORM) if own else stated)
     else:
-        alone = profiles_of(path, stated.pitch_mm)[0]
-        profiles = tuple(UNITS[profile_unit(alone, unit)] * p for p in alone.points)
+        bare = profiles_of(path, stated.pitch_mm)[0]
+        profiles = tuple(UNITS[profile_unit(bare, unit)] * p for p in bare.points)
         file = Measurements(arrays={}, profiles=profiles, digest=digest_of(path))
     _check_numbers(path, file.arrays, file.profiles)
     X = file.poses()
@@ -239,7 +241,7 @@ def _check_numbers(path: Path, arrays: dict[str, Floats], profiles: tuple[Floats
 
 
 def _from_npz(
-    path: Path, unit: str | None, dataset: str, trial: int | None
+    path: Path, unit: str | None, dataset: str, trial: int | None, alone: bool
 ) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
     raw: dict[str, AnyArray] = read_npz(path)
     said = str(raw.pop("unit")) if "unit" in raw else unit
@@ -253,9 +255,9 @@ def _from_npz(
     sets = sorted({name[: -len("_Rb")] for name in raw if name.endswith("_Rb")})
     if sets and dataset not in sets:
         raise InputError(f"The file has several sets. Choose one with --as set={' | set='.join(sets)}.")
-    if dataset and not sets:
+    if dataset and not sets and alone:
         raise InputError(f"The file has no sets. Omit --as set={dataset}.")
-    if dataset:
+    if dataset and sets:
         level = raw.get(f"sigma_{dataset.rsplit('_', 1)[-1]}")  # of the noise that the set is named after
         raw = {
             name.removeprefix(f"{dataset}_"): v

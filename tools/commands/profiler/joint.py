@@ -112,7 +112,9 @@ def planes_decided(files: Sequence[Measurements], form: str = "") -> list[Measur
 
 
 @command(
-    "profiler planes", keys=("robot-form", "pitch", "sensor-correction"), short_help="Calibrate by one to three planes."
+    "profiler planes",
+    keys=("robot-form", "set", "trial", "pitch", "sensor-correction"),
+    short_help="Calibrate by one to three planes.",
 )
 def planes(
     call: Call,
@@ -127,7 +129,7 @@ def planes(
 
 @command(
     "profiler joint",
-    keys=("robot-form", "pitch", "side", "z", "sensor-correction", *SIGMAS_MM),
+    keys=("robot-form", "set", "trial", "pitch", "side", "z", "sensor-correction", *SIGMAS_MM),
     short_help="Calibrate by edge, sphere and planes together.",
 )
 def joint(
@@ -165,7 +167,14 @@ def _joined(
     check_limit(limit_mm)
     r, x, z = (1e-3 * call.reading.get(key, usual) for key, usual in SIGMAS_MM.items())
     sigmas = Sigmas(r, x, z, stated=any(key in call.reading for key in SIGMAS_MM))
-    read = {kind: [read_measurements(call, f, unit, poses) for k, f in given if k == kind] for kind in KINDS}
+    read: dict[str, list[Measurements]] = {kind: [] for kind in KINDS}
+    for kind, path in given:
+        try:
+            read[kind].append(read_measurements(call, path, unit, poses, alone=len(given) == 1))
+        except InputError as problem:
+            if len(given) == 1:
+                raise
+            raise InputError(f"{kind}:{path.name}: {problem}") from problem
     lost: list[int] = []
     shown, sphere, data = None, None, [*read["planes"]]
     if read["edge"]:

@@ -41,11 +41,13 @@ TouchesOption = Annotated[Path | None, option("--touches", "FILE", "CSV of flang
 TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flange frame, mm.")]
 
 
-def read_measurements(call: Call, file: Path, unit: str | None, poses: Path | None, posed: bool = True) -> Measurements:
-    """Read a file as --as states it, with the flange's poses if ``posed``."""
+def read_measurements(
+    call: Call, file: Path, unit: str | None, poses: Path | None, posed: bool = True, alone: bool = True
+) -> Measurements:
+    """Read a file as --as states it, with the flange's poses if ``posed``; ``alone``: no other file is read with it."""
     stated = PosesStated(poses, call.reading.get("robot-form", ""), call.reading.get("pitch"))
     known = {"dataset": call.reading.get("set", ""), "trial": call.reading.get("trial")}
-    return read_profiler_file(file, unit=unit, **known, stated=stated, posed=posed)
+    return read_profiler_file(file, unit=unit, **known, stated=stated, posed=posed, alone=alone)
 
 
 def stated_correction(call: Call, profiles: Sequence[Floats]) -> SensorCorrection | None:
