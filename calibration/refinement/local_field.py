@@ -37,7 +37,7 @@ _USUAL_FACTOR = np.array(
     [2.0, 1.5, 2.7, 2.7]
 )  # by which these differ from cell to cell (one standard deviation of the logarithm)
 _STARTS_M = (0.08, 0.2, 0.5)
-_TIGHT = {"ftol": 1e-14, "gtol": 1e-8}  # of a cost of order 100, in logarithms: near what rounding allows
+_COST, _SLOPE = 1e-14, 1e-8  # where the search ends, of a cost of order 100: near what rounding allows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,7 +163,10 @@ def fit_field(X_BR: Sequence[RigidTransform], residuals: Array) -> LocalField:
         (float(m - 4.0 * w), float(m + 4.0 * w)) for m, w in zip(np.log(_USUAL), np.log(_USUAL_FACTOR), strict=True)
     ]
     # the optimum is flat: with one-sided differences it depends on the processor's rounding
-    fits = (minimize(cost, s, method="L-BFGS-B", jac="3-point", bounds=wide, options=_TIGHT) for s in starts)
+    fits = (
+        minimize(cost, s, method="L-BFGS-B", jac="3-point", bounds=wide, options={"ftol": _COST, "gtol": _SLOPE})
+        for s in starts
+    )
     found = min(fits, key=lambda f: float(f.fun))
     length, turn, field, scan = (float(v) for v in np.exp(found.x))
     return LocalField(

@@ -14,7 +14,7 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     # Without blank lines, comments and docstrings. What one folder gains, another loses in the same commit.
-    "code lines of calibration": 32_972,
+    "code lines of calibration": 32_975,
     "code lines of models": 6_469,
     "code lines of systems": 19_389,
     "code lines of tools": 23_975,
